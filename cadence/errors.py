@@ -1,0 +1,41 @@
+"""The one exception tree: every foreseen failure names what is wrong, where, and what to do.
+
+`cli.main` catches `CadenceError` once, prints it as one line and leaves with `exit_code`. Anything else is a defect
+and keeps its traceback.
+"""
+
+
+class CadenceError(Exception):
+    """A foreseen failure; `str(error)` is one line: what, where, what to do."""
+
+    exit_code = 1
+
+
+class UsageError(CadenceError):
+    """The call itself is wrong: an argument that is missing, unknown or contradictory."""
+
+    exit_code = 2
+
+
+class InputError(CadenceError):
+    """An input cannot be used: not an MCAP, empty, no detections, NaN everywhere."""
+
+    exit_code = 3
+
+
+class ConfigError(CadenceError):
+    """A configuration, mapping or checkpoint does not fit: unknown key, wrong type, wrong shape."""
+
+    exit_code = 4
+
+
+class DeviceError(CadenceError):
+    """Compute or storage failed: no such device, out of memory, unwritable output."""
+
+    exit_code = 5
+
+
+class QualityGateError(CadenceError):
+    """A result was produced but does not meet the gate that was asked for."""
+
+    exit_code = 6

@@ -1,0 +1,136 @@
+"""Values that flow between the estimators: windows of detections in, weighted joint hypotheses out.
+
+Letters of every shape: B window, K hypothesis, A agent, T time step, D space (2), N detection. Times are float seconds
+relative to the window origin, positions float metres relative to the window datum (float64 in, see `pipeline.windows`).
+"""
+
+from dataclasses import dataclass
+from typing import Protocol, Self
+
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class Detections:
+    """Padded detections of every agent of every window, oldest first, padding last.
+
+    time_s        [B, A, N] seconds relative to the window origin; padding repeats any finite value
+    position_m    [B, A, N, 2] metres relative to the window datum
+    covariance_m2 [B, A, N, 2, 2] symmetric positive definite position covariance
+    is_observed   [B, A, N] bool, False on padding
+    """
+
+    time_s: Tensor
+    position_m: Tensor
+    covariance_m2: Tensor
+    is_observed: Tensor
+
+    def __post_init__(self) -> None:
+        shape = tuple(self.time_s.shape)
+        expected = {"position_m": (*shape, 2), "covariance_m2": (*shape, 2, 2), "is_observed": shape}
+        for name, want in expected.items():
+            got = tuple(getattr(self, name).shape)
+            if len(shape) != 3 or got != want:
+                raise ValueError(f"Detections.{name} has shape {got}, expected {want} ([B, A, N] plus space)")
+        if self.is_observed.dtype != torch.bool:
+            raise ValueError(f"Detections.is_observed must be bool, got {self.is_observed.dtype}")
+
+    @property
+    def count(self) -> Tensor:
+        """Number of detections [B, A]."""
+        return self.is_observed.sum(dim=-1)
+
+    def __getitem__(self, windows: slice | Tensor) -> "Detections":
+        """The same detections for a selection of windows (first axis)."""
+        return Detections(
+            self.time_s[windows], self.position_m[windows], self.covariance_m2[windows], self.is_observed[windows]
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class WindowBatch:
+    """Windows that share one time grid.
+
+    time_s     [T] step times relative to the origin, evenly spaced; time_s[origin_index] == 0
+    detections see `Detections`; all lie at or before the origin (the future is what is asked for)
+    seeds      [B] int64, one per window: a hypothesis depends on its window's seed, never on its neighbours in the batch
+    origin_index  number of steps before the origin
+    """
+
+    time_s: Tensor
+    detections: Detections
+    seeds: Tensor
+    origin_index: int
+
+    def __post_init__(self) -> None:
+        if self.time_s.ndim != 1 or not 0 <= self.origin_index < len(self.time_s):
+            raise ValueError(f"WindowBatch: origin_index {self.origin_index} outside a grid of {tuple(self.time_s.shape)}")
+        if self.seeds.shape != self.detections.time_s.shape[:1]:
+            raise ValueError(f"WindowBatch: {tuple(self.seeds.shape)} seeds for {self.num_windows} windows")
+
+    @property
+    def num_windows(self) -> int:
+        return int(self.detections.time_s.shape[0])
+
+    @property
+    def num_agents(self) -> int:
+        return int(self.detections.time_s.shape[1])
+
+    @property
+    def num_steps(self) -> int:
+        return len(self.time_s)
+
+    @property
+    def step_s(self) -> float:
+        return float(self.time_s[1] - self.time_s[0])
+
+    @property
+    def is_active(self) -> Tensor:
+        """Agents with at least one detection [B, A]; nothing can be said about the others."""
+        return self.detections.is_observed.any(dim=-1)
+
+    def __getitem__(self, windows: slice | Tensor) -> "WindowBatch":
+        """The same grid for a selection of windows."""
+        return WindowBatch(self.time_s, self.detections[windows], self.seeds[windows], self.origin_index)
+
+
+@dataclass(frozen=True, eq=False)
+class HypothesisSet:
+    """Weighted joint hypotheses.
+
+    position_m [B, K, A, T, 2] metres relative to the window datum; NaN for agents that are not active
+    weight     [B, K] non-negative, each row sums to one
+    status     [B][A] "ok", "no_detections", "infeasible" (a hypothesis could not be moved out of an obstacle), ...
+    """
+
+    position_m: Tensor
+    weight: Tensor
+    status: tuple[tuple[str, ...], ...]
+
+    def __post_init__(self) -> None:
+        b, k, a = self.position_m.shape[:3]
+        if self.position_m.ndim != 5 or self.position_m.shape[-1] != 2:
+            raise ValueError(f"HypothesisSet.position_m has shape {tuple(self.position_m.shape)}, expected [B, K, A, T, 2]")
+        if tuple(self.weight.shape) != (b, k):
+            raise ValueError(f"HypothesisSet.weight has shape {tuple(self.weight.shape)}, expected {(b, k)}")
+        if len(self.status) != b or any(len(row) != a for row in self.status):
+            raise ValueError("HypothesisSet.status must hold one word per window and agent")
+
+
+class Estimator(Protocol):
+    """What the diffusion model and every rival implement: the same call, joint samples out."""
+
+    name: str
+
+    def fit(self, tracks: Detections) -> Self:
+        """The estimator adapted to one log by the likelihood of its detections (empirical Bayes); no truth involved.
+
+        `tracks` holds one uninterrupted stretch of one agent's detections per row ([B, 1, N], any time origin a row).
+        Estimators without anything to adapt return themselves.
+        """
+        ...
+
+    def sample(self, windows: WindowBatch, num_hypotheses: int) -> HypothesisSet:
+        """Draw joint hypotheses; deterministic in `windows.seeds`."""
+        ...

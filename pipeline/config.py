@@ -1,0 +1,133 @@
+"""Strict configuration: frozen dataclasses read from TOML tables and `--set a.b=value`, through one reader.
+
+An unknown key is an error that names the known ones; a value of the wrong type is an error that names the right one.
+"""
+
+import dataclasses
+import tomllib
+import types
+import typing
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from cadence.errors import ConfigError
+
+
+def load_toml(path: Path) -> dict[str, Any]:
+    """The tables of a TOML file; `ConfigError` names file, line and column."""
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot read the configuration ({error.strerror}); check the path") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: not valid TOML: {error}; correct the file") from error
+
+
+def parse_override(text: str) -> tuple[tuple[str, ...], Any]:
+    """`a.b=value` as (("a", "b"), value); the value is TOML, or a bare string where it is not TOML."""
+    key, separator, value = text.partition("=")
+    if not separator or not key.strip():
+        raise ConfigError(f"--set {text!r}: expected KEY=VALUE, for example --set infer.num_hypotheses=50")
+    try:
+        parsed = tomllib.loads(f"value = {value}")["value"]
+    except tomllib.TOMLDecodeError:
+        parsed = value
+    return tuple(part.strip() for part in key.split(".")), parsed
+
+
+def merge_overrides(tables: Mapping[str, Any], overrides: Sequence[str]) -> dict[str, Any]:
+    """A copy of `tables` with every `a.b=value` of `overrides` put in its place; later ones win."""
+    merged: dict[str, Any] = {key: dict(value) if isinstance(value, Mapping) else value for key, value in tables.items()}
+    for text in overrides:
+        path, value = parse_override(text)
+        node = merged
+        for part in path[:-1]:
+            child = node.setdefault(part, {})
+            if not isinstance(child, Mapping):
+                raise ConfigError(f"--set {text!r}: {part!r} is a value, not a table")
+            node[part] = child = dict(child)
+            node = child
+        node[path[-1]] = value
+    return merged
+
+
+def read_config[T](cls: type[T], tables: Mapping[str, Any], where: str = "config") -> T:
+    """An instance of the frozen dataclass `cls` from TOML tables; missing keys take their defaults."""
+    fields = {field.name: field for field in dataclasses.fields(cls)}  # type: ignore[arg-type]
+    unknown = [key for key in tables if key not in fields]
+    if unknown:
+        raise ConfigError(f"{where}: unknown key {unknown[0]!r}; known keys: {', '.join(sorted(fields))}")
+    hints = typing.get_type_hints(cls)
+    values = {key: _convert(hints[key], value, f"{where}.{key}") for key, value in tables.items()}
+    missing = [
+        name
+        for name, field in fields.items()
+        if name not in values and field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
+    ]
+    if missing:
+        raise ConfigError(f"{where}: key {missing[0]!r} is missing and has no default")
+    try:
+        return cls(**values)
+    except ValueError as error:
+        raise ConfigError(f"{where}: {error}") from error
+
+
+def config_as_dict(config: object) -> dict[str, Any]:
+    """The resolved configuration as plain JSON-able values, for manifests."""
+    return typing.cast(dict[str, Any], _plain(dataclasses.asdict(config)))  # type: ignore[call-overload]
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    return str(value) if isinstance(value, Path) else value
+
+
+def _convert(hint: Any, value: Any, where: str) -> Any:
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if hint is Any:
+        return value
+    if origin in (typing.Union, types.UnionType):
+        return _convert_union(arguments, value, where)
+    if origin is typing.Literal:
+        if value in arguments:
+            return value
+        raise ConfigError(f"{where}: {value!r} is not one of {', '.join(map(str, arguments))}")
+    if dataclasses.is_dataclass(hint):
+        if isinstance(value, Mapping):
+            return read_config(typing.cast(type[Any], hint), value, where)
+        raise ConfigError(f"{where}: expected a table, got {value!r}")
+    if origin is tuple and isinstance(value, list | tuple):
+        if len(arguments) == 2 and arguments[1] is Ellipsis:
+            return tuple(_convert(arguments[0], item, f"{where}[{i}]") for i, item in enumerate(value))
+        if len(arguments) == len(value):
+            return tuple(_convert(kind, item, f"{where}[{i}]") for i, (kind, item) in enumerate(zip(arguments, value, strict=True)))
+    if origin is dict and isinstance(value, Mapping):
+        return {str(key): _convert(arguments[1], item, f"{where}.{key}") for key, item in value.items()}
+    if hint is Path and isinstance(value, str):
+        return Path(value)
+    if hint is float and isinstance(value, int | float) and not isinstance(value, bool):
+        return float(value)
+    if isinstance(hint, type) and isinstance(value, hint) and (hint is bool or not isinstance(value, bool)):
+        return value
+    raise ConfigError(f"{where}: expected {_describe(hint)}, got {value!r}")
+
+
+def _convert_union(arguments: tuple[Any, ...], value: Any, where: str) -> Any:
+    if value is None and type(None) in arguments:
+        return None
+    errors = []
+    for argument in arguments:
+        if argument is not type(None):
+            try:
+                return _convert(argument, value, where)
+            except ConfigError as error:
+                errors.append(error)
+    raise errors[0] if len(errors) == 1 else ConfigError(f"{where}: got {value!r}, which fits none of the allowed types")
+
+
+def _describe(hint: Any) -> str:
+    return getattr(hint, "__name__", str(hint)) if typing.get_origin(hint) is None else str(hint)

@@ -1,0 +1,115 @@
+"""Stages that are atomic, repeatable and skippable: work in a temporary folder, rename, manifest last.
+
+A mission directory holds the files of one log, and one `<stage>.manifest.json` a stage: its resolved configuration,
+the hashes of its inputs and outputs, the versions and a summary — enough to repeat the run, and to know that it need not be.
+"""
+
+import contextlib
+import hashlib
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from cadence.errors import DeviceError
+from pipeline.config import config_as_dict
+from pipeline.provenance import versions
+
+JsonObject = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class StageResult:
+    """What one stage did for one log; `summary` is JSON-able and printed by `--json`."""
+
+    stage: str
+    status: Literal["done", "skipped"]
+    outputs: tuple[Path, ...]
+    summary: JsonObject
+
+
+def hash_file(path: Path) -> str:
+    """SHA-256 of the content, read in blocks."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def manifest_path(stage: str, directory: Path) -> Path:
+    """Where the manifest of `stage` lies."""
+    return directory / f"{stage}.manifest.json"
+
+
+def read_manifest(stage: str, directory: Path) -> dict[str, Any] | None:
+    """The manifest of an earlier run of `stage`; None where there is none, or none that can be read."""
+    try:
+        manifest = json.loads(manifest_path(stage, directory).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    return manifest if isinstance(manifest, dict) else None
+
+
+def run_stage(
+    stage: str,
+    directory: Path,
+    *,
+    config: object,
+    inputs: Sequence[Path],
+    body: Callable[[Path], JsonObject],
+    force: bool = False,
+) -> StageResult:
+    """Run `body` for `stage` unless an earlier run with the same inputs, configuration and versions left its outputs intact.
+
+    `body` gets an empty temporary folder inside `directory`, writes its output files there and returns the summary. Its
+    files are then renamed into `directory`, the manifest last: a killed run leaves nothing that looks finished.
+    """
+    key = {
+        "stage": stage,
+        "config": config_as_dict(config),
+        "inputs": {path.name: hash_file(path) for path in inputs},
+        "versions": versions(),
+    }
+    earlier = None if force else read_manifest(stage, directory)
+    if earlier is not None and all(earlier.get(name) == value for name, value in key.items()):
+        outputs = earlier["outputs"]
+        if all((directory / name).is_file() and hash_file(directory / name) == digest for name, digest in outputs.items()):
+            return StageResult(stage, "skipped", tuple(directory / name for name in outputs), earlier["summary"])
+    with _working_folder(stage, directory) as work:
+        summary = body(work)
+        names = sorted(path.name for path in work.iterdir())
+        manifest = {**key, "outputs": {name: hash_file(work / name) for name in names}, "summary": dict(summary)}
+        # A manifest of an earlier run must not vouch for a mixture of old and new files.
+        manifest_path(stage, directory).unlink(missing_ok=True)
+        for name in names:
+            os.replace(work / name, directory / name)
+        write_atomic(manifest_path(stage, directory), json.dumps(manifest, indent=1, sort_keys=True) + "\n")
+    return StageResult(stage, "done", tuple(directory / name for name in names), summary)
+
+
+def write_atomic(path: Path, text: str) -> None:
+    """Write a small text file so that readers see the old or the new content, never a part."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile("w", dir=path.parent, prefix=f".{path.name}.", delete=False, encoding="utf-8") as file:
+            file.write(text)
+        os.replace(file.name, path)
+    except OSError as error:
+        raise DeviceError(f"{path}: cannot write ({error.strerror}); check the folder and the free space") from error
+
+
+@contextlib.contextmanager
+def _working_folder(stage: str, directory: Path) -> Iterator[Path]:
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        work = Path(tempfile.mkdtemp(prefix=f".{stage}.", dir=directory))
+    except OSError as error:
+        raise DeviceError(f"{directory}: cannot write there ({error.strerror}); choose another --out") from error
+    try:
+        yield work
+    except OSError as error:
+        raise DeviceError(f"{directory}: {stage} could not write its output ({error}); check the free space") from error
+    finally:
+        shutil.rmtree(work, ignore_errors=True)

@@ -1,0 +1,50 @@
+"""Parquet files between the stages: written with their schema and frame, read back only where both fit."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from cadence.errors import InputError
+from schemas.tables import VERSION
+
+
+@dataclass(frozen=True)
+class Frame:
+    """The mission frame: x east, y north, metres. The datum is set for georeferenced logs."""
+
+    frame_id: str
+    latitude_deg: float | None = None
+    longitude_deg: float | None = None
+
+    @property
+    def is_georeferenced(self) -> bool:
+        """Whether positions can be brought back to latitude and longitude."""
+        return self.latitude_deg is not None and self.longitude_deg is not None
+
+
+def write_table(table: pa.Table, path: Path, name: str, frame: Frame) -> None:
+    """Write `table` (its schema must be that of `name` in `schemas.tables`) with version and frame in its metadata."""
+    frame_json = {"frame_id": frame.frame_id, "latitude_deg": frame.latitude_deg, "longitude_deg": frame.longitude_deg}
+    metadata = {"cadence.table": name, "cadence.version": str(VERSION), "cadence.frame": json.dumps(frame_json)}
+    pq.write_table(table.replace_schema_metadata(metadata), path, compression="zstd")
+
+
+def read_table(path: Path, name: str) -> tuple[pa.Table, Frame]:
+    """The table called `name` and its frame; `InputError` where the file is absent, damaged or of another kind or version."""
+    if not path.is_file():
+        raise InputError(f"{path}: not found; run the stage that writes it first (cadence run does all of them)")
+    try:
+        table = pq.read_table(path)
+        metadata: dict[bytes, Any] = table.schema.metadata or {}
+        kind = metadata.get(b"cadence.table", b"").decode()
+        version = metadata.get(b"cadence.version", b"").decode()
+        frame = Frame(**json.loads(metadata.get(b"cadence.frame", b"{}")))
+    except (pa.ArrowException, OSError, ValueError, TypeError) as error:
+        raise InputError(f"{path}: not a readable cadence table ({error}); run its stage again with --force") from error
+    if kind != name or version != str(VERSION):
+        raise InputError(f"{path}: holds {kind or 'an unknown table'} version {version or '?'}, expected {name} version {VERSION}; run its stage again")
+    return table, frame

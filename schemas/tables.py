@@ -1,0 +1,91 @@
+"""Arrow schemas of the files between the stages. Times int64 ns, positions float64 metres in the mission frame.
+
+Every file carries the schema metadata keys `cadence.table`, `cadence.version` and `cadence.frame` (JSON: see `FRAME_KEYS`).
+"""
+
+import pyarrow as pa
+
+VERSION = 1
+"""Raised when a column changes meaning; readers refuse other versions."""
+
+FRAME_KEYS = ("frame_id", "latitude_deg", "longitude_deg")
+"""Keys of the `cadence.frame` JSON: the name of the mission frame and, for georeferenced logs, its datum (else null)."""
+
+DETECTIONS = pa.schema(
+    [
+        pa.field("log_id", pa.string(), nullable=False),
+        pa.field("time_ns", pa.int64(), nullable=False),
+        pa.field("sensor_id", pa.string()),
+        pa.field("agent_id", pa.string()),  # null = origin unknown
+        pa.field("x_m", pa.float64(), nullable=False),
+        pa.field("y_m", pa.float64(), nullable=False),
+        pa.field("z_m", pa.float64()),
+        pa.field("cov_xx_m2", pa.float64()),  # null = exact up to the configured floor
+        pa.field("cov_xy_m2", pa.float64()),
+        pa.field("cov_yy_m2", pa.float64()),
+        pa.field("score", pa.float32()),
+        pa.field("num_merged", pa.int32(), nullable=False),  # simultaneous detections collapsed into this one
+        pa.field("topic", pa.string(), nullable=False),  # provenance: topic + log time + sequence find the message
+        pa.field("log_time_ns", pa.int64(), nullable=False),
+        pa.field("sequence", pa.int64(), nullable=False),
+    ]
+)
+
+TRUTH = pa.schema(
+    [
+        pa.field("log_id", pa.string(), nullable=False),
+        pa.field("time_ns", pa.int64(), nullable=False),
+        pa.field("agent_id", pa.string(), nullable=False),
+        pa.field("x_m", pa.float64(), nullable=False),
+        pa.field("y_m", pa.float64(), nullable=False),
+        pa.field("z_m", pa.float64()),
+    ]
+)
+
+POSES = pa.schema(
+    [
+        pa.field("log_id", pa.string(), nullable=False),
+        pa.field("time_ns", pa.int64(), nullable=False),
+        pa.field("sensor_id", pa.string(), nullable=False),
+        pa.field("x_m", pa.float64(), nullable=False),
+        pa.field("y_m", pa.float64(), nullable=False),
+        pa.field("z_m", pa.float64()),
+    ]
+)
+
+WINDOWS = pa.schema(
+    [
+        pa.field("window", pa.int32(), nullable=False),
+        pa.field("origin_ns", pa.int64(), nullable=False),
+        pa.field("agent_id", pa.string(), nullable=False),
+        pa.field("status", pa.string(), nullable=False),
+        pa.field("advice", pa.string()),
+        pa.field("num_detections", pa.int32(), nullable=False),
+        pa.field("age_s", pa.float64()),  # of the last detection at the origin; null without any
+        pa.field("spread_m", pa.float64()),  # root mean square distance to the mean at the origin
+    ]
+)
+"""One row per window and agent, also where no hypothesis could be drawn."""
+
+
+def hypotheses_schema(num_steps: int) -> pa.Schema:
+    """HYPOTHESES: one row per window, hypothesis and agent (only agents with status ok or infeasible).
+
+    Step i lies at origin_ns + (i - origin_index) * step_ns; position_m is [T, 2] float32 relative to the datum
+    (datum_x_m, datum_y_m) in the mission frame. weight is that of the joint hypothesis: equal for all its agents.
+    """
+    return pa.schema(
+        [
+            pa.field("log_id", pa.string(), nullable=False),
+            pa.field("window", pa.int32(), nullable=False),
+            pa.field("origin_ns", pa.int64(), nullable=False),
+            pa.field("step_ns", pa.int64(), nullable=False),
+            pa.field("origin_index", pa.int32(), nullable=False),
+            pa.field("agent_id", pa.string(), nullable=False),
+            pa.field("hypothesis", pa.int32(), nullable=False),
+            pa.field("weight", pa.float32(), nullable=False),
+            pa.field("datum_x_m", pa.float64(), nullable=False),
+            pa.field("datum_y_m", pa.float64(), nullable=False),
+            pa.field("position_m", pa.list_(pa.list_(pa.float32(), 2), num_steps), nullable=False),
+        ]
+    )
