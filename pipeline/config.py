@@ -9,7 +9,9 @@ import types
 import typing
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
+
+T = TypeVar("T")
 
 from cadence.errors import ConfigError
 
@@ -52,7 +54,7 @@ def merge_overrides(tables: Mapping[str, Any], overrides: Sequence[str]) -> dict
     return merged
 
 
-def read_config[T](cls: type[T], tables: Mapping[str, Any], where: str = "config") -> T:
+def read_config(cls: type[T], tables: Mapping[str, Any], where: str = "config") -> T:
     """An instance of the frozen dataclass `cls` from TOML tables; missing keys take their defaults."""
     fields = {field.name: field for field in dataclasses.fields(cls)}  # type: ignore[arg-type]
     unknown = [key for key in tables if key not in fields]
