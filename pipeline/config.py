@@ -11,9 +11,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
-T = TypeVar("T")
-
 from cadence.errors import ConfigError
+
+T = TypeVar("T")
 
 
 def load_toml(path: Path) -> dict[str, Any]:
