@@ -1,0 +1,56 @@
+# Every target sets up .venv by itself. Needed beforehand: Python 3.11 or newer, git, make.
+PYTHON ?= $(shell for p in python3 python3.14 python3.13 python3.12 python3.11; do \
+	$$p -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo $$p && break; done)
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+SOURCES := cli.py cadence pipeline schemas tests benchmarks
+DEMO := out/demo
+
+.DEFAULT_GOAL := help
+.PHONY: help setup demo test check fix bench clean
+
+help:  ## Show this list.
+	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 10
+
+setup: $(STAMP)  ## Make or update .venv with the pinned dependencies.
+
+$(STAMP): pyproject.toml constraints.txt
+	@test -n "$(PYTHON)" || { echo "make: Python 3.11 or newer not found; install it or call make PYTHON=/path/to/python" >&2; exit 1; }
+	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	@echo "Installing into $(VENV) (the first time downloads PyTorch) ..."
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	@touch $@
+
+demo: $(STAMP)  ## Simulate a mission, run the whole pipeline on it, say where to look.
+	$(BIN)/cadence simulate --out $(DEMO)/logs --set simulate.kind=patrol --set simulate.episodes=1 --seed 7 --force
+	$(BIN)/cadence run $(DEMO)/logs/*.mcap --out $(DEMO)/results
+	@echo
+	@echo "Look at:"
+	@echo "  report      $$(ls $(DEMO)/results/*/report.html)    (any browser)"
+	@echo "  in Foxglove $$(ls $(DEMO)/logs/*.mcap) together with $$(ls $(DEMO)/results/*/*.cadence.mcap)"
+	@echo "  layout      $$(ls $(DEMO)/results/*/*.layout.json | head -1)    (Foxglove: Layouts, Import from file)"
+	@echo "Next:"
+	@echo "  $(BIN)/cadence evaluate $(DEMO)/results/*"
+	@echo "  $(BIN)/cadence info YOUR_LOG.mcap"
+	@echo "  $(BIN)/cadence run YOUR_LOG.mcap --out out/mine"
+
+test: $(STAMP)  ## Run all tests.
+	$(BIN)/python -m pytest
+
+check: $(STAMP)  ## Lint, format check, types, fast tests.
+	$(BIN)/ruff check $(SOURCES)
+	$(BIN)/ruff format --check $(SOURCES)
+	$(BIN)/mypy
+	$(BIN)/python -m pytest -q tests/test_layers.py tests/test_api.py tests/test_docs.py tests/test_cli.py tests/pipeline tests/cadence
+
+fix: $(STAMP)  ## Let ruff mend what it can, and format.
+	$(BIN)/ruff check --fix $(SOURCES)
+	$(BIN)/ruff format $(SOURCES)
+
+bench: $(STAMP)  ## Run every benchmark script; each prints its own table.
+	@for script in benchmarks/*.py; do echo "== $$script"; $(BIN)/python $$script || exit 1; done
+
+clean:  ## Remove what was built and written here; keeps .venv.
+	rm -rf build dist out *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	find . -name __pycache__ -not -path './$(VENV)/*' -prune -exec rm -rf {} +
