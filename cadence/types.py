@@ -71,18 +71,22 @@ class WindowBatch:
 
     @property
     def num_windows(self) -> int:
+        """Number of windows B."""
         return int(self.detections.time_s.shape[0])
 
     @property
     def num_agents(self) -> int:
+        """Number of agents A."""
         return int(self.detections.time_s.shape[1])
 
     @property
     def num_steps(self) -> int:
+        """Number of time steps T."""
         return len(self.time_s)
 
     @property
     def step_s(self) -> float:
+        """Seconds between two steps."""
         return float(self.time_s[1] - self.time_s[0])
 
     @property

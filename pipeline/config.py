@@ -4,6 +4,7 @@ An unknown key is an error that names the known ones; a value of the wrong type 
 """
 
 import dataclasses
+import math
 import tomllib
 import types
 import typing
@@ -14,6 +15,9 @@ from typing import Any, TypeVar
 from cadence.errors import ConfigError
 
 T = TypeVar("T")
+
+TABLES = ("ingest", "extract", "infer", "export", "report", "evaluate", "simulate", "train")
+"""The tables of a configuration file, one a stage. One file may hold all of them; each command reads its own."""
 
 
 def load_toml(path: Path) -> dict[str, Any]:
@@ -26,6 +30,21 @@ def load_toml(path: Path) -> dict[str, Any]:
         raise ConfigError(f"{path}: not valid TOML: {error}; correct the file") from error
 
 
+def load_tables(path: Path | None, overrides: Sequence[str] = ()) -> dict[str, dict[str, Any]]:
+    """The tables of the file at `path` (none: no file) with the `a.b=value` of `overrides` put in.
+
+    A top-level key that is not in `TABLES` is a `ConfigError`, so that a misspelt table is never silently without effect.
+    """
+    tables = merge_overrides(load_toml(path) if path is not None else {}, overrides)
+    where = str(path) if path is not None else "--set"
+    for name, table in tables.items():
+        if name not in TABLES:
+            raise ConfigError(f"{where}: unknown table {name!r}; known tables: {', '.join(TABLES)}")
+        if not isinstance(table, Mapping):
+            raise ConfigError(f"{where}: {name!r} is a table, not a value; write {name}.KEY = {table!r} with one of its keys")
+    return tables
+
+
 def parse_override(text: str) -> tuple[tuple[str, ...], Any]:
     """`a.b=value` as (("a", "b"), value); the value is TOML, or a bare string where it is not TOML."""
     key, separator, value = text.partition("=")
@@ -34,6 +53,8 @@ def parse_override(text: str) -> tuple[tuple[str, ...], Any]:
     try:
         parsed = tomllib.loads(f"value = {value}")["value"]
     except tomllib.TOMLDecodeError:
+        parsed = value
+    if not isinstance(parsed, str | int | float | list | dict):  # a bare date or time of day: no key wants one
         parsed = value
     return tuple(part.strip() for part in key.split(".")), parsed
 
@@ -59,7 +80,7 @@ def read_config(cls: type[T], tables: Mapping[str, Any], where: str = "config") 
     fields = {field.name: field for field in dataclasses.fields(cls)}  # type: ignore[arg-type]
     unknown = [key for key in tables if key not in fields]
     if unknown:
-        raise ConfigError(f"{where}: unknown key {unknown[0]!r}; known keys: {', '.join(sorted(fields))}")
+        raise ConfigError(f"{where}: unknown key {unknown[0]!r}; known keys: {', '.join(fields)}")
     hints = typing.get_type_hints(cls)
     values = {key: _convert(hints[key], value, f"{where}.{key}") for key, value in tables.items()}
     missing = [
@@ -106,14 +127,17 @@ def _convert(hint: Any, value: Any, where: str) -> Any:
         if len(arguments) == 2 and arguments[1] is Ellipsis:
             return tuple(_convert(arguments[0], item, f"{where}[{i}]") for i, item in enumerate(value))
         if len(arguments) == len(value):
-            return tuple(_convert(kind, item, f"{where}[{i}]") for i, (kind, item) in enumerate(zip(arguments, value, strict=True)))
+            return tuple(
+                _convert(kind, item, f"{where}[{i}]") for i, (kind, item) in enumerate(zip(arguments, value, strict=True))
+            )
     if origin is dict and isinstance(value, Mapping):
         return {str(key): _convert(arguments[1], item, f"{where}.{key}") for key, item in value.items()}
     if hint is Path and isinstance(value, str):
         return Path(value)
-    if hint is float and isinstance(value, int | float) and not isinstance(value, bool):
+    if hint is float and isinstance(value, int) and not isinstance(value, bool):
         return float(value)
-    if isinstance(hint, type) and isinstance(value, hint) and (hint is bool or not isinstance(value, bool)):
+    is_number = not (isinstance(value, float) and math.isnan(value))  # TOML has nan; no key means anything by it
+    if isinstance(hint, type) and isinstance(value, hint) and (hint is bool or not isinstance(value, bool)) and is_number:
         return value
     raise ConfigError(f"{where}: expected {_describe(hint)}, got {value!r}")
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from cadence.errors import DeviceError
+from cadence.errors import DeviceError, InputError
 from pipeline.config import config_as_dict
 from pipeline.provenance import versions
 
@@ -33,9 +33,14 @@ class StageResult:
 
 
 def hash_file(path: Path) -> str:
-    """SHA-256 of the content, read in blocks."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+    """SHA-256 of the content, read in blocks; `InputError` where the file is absent or cannot be read."""
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: not found; check the path, or run the stage that writes it first") from error
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); check that it is a file and its permissions") from error
 
 
 def manifest_path(stage: str, directory: Path) -> Path:
@@ -64,7 +69,8 @@ def run_stage(
     """Run `body` for `stage` unless an earlier run with the same inputs, configuration and versions left its outputs intact.
 
     `body` gets an empty temporary folder inside `directory`, writes its output files there and returns the summary. Its
-    files are then renamed into `directory`, the manifest last: a killed run leaves nothing that looks finished.
+    files are then renamed into `directory`, the manifest last: a killed run leaves nothing that looks finished. Files that
+    an earlier run of the stage left and this one did not write again are removed: nobody shall read a mixture.
     """
     key = {
         "stage": stage,
@@ -72,11 +78,11 @@ def run_stage(
         "inputs": {path.name: hash_file(path) for path in inputs},
         "versions": versions(),
     }
-    earlier = None if force else read_manifest(stage, directory)
-    if earlier is not None and all(earlier.get(name) == value for name, value in key.items()):
-        outputs = earlier["outputs"]
-        if all((directory / name).is_file() and hash_file(directory / name) == digest for name, digest in outputs.items()):
-            return StageResult(stage, "skipped", tuple(directory / name for name in outputs), earlier["summary"])
+    earlier = read_manifest(stage, directory)
+    if not force and earlier is not None:
+        skipped = _still_valid(stage, directory, earlier, key)
+        if skipped is not None:
+            return skipped
     with _working_folder(stage, directory) as work:
         summary = body(work)
         names = sorted(path.name for path in work.iterdir())
@@ -85,19 +91,36 @@ def run_stage(
         manifest_path(stage, directory).unlink(missing_ok=True)
         for name in names:
             os.replace(work / name, directory / name)
+        for name in set((earlier or {}).get("outputs", ())) - set(names):
+            (directory / Path(name).name).unlink(missing_ok=True)
         write_atomic(manifest_path(stage, directory), json.dumps(manifest, indent=1, sort_keys=True) + "\n")
     return StageResult(stage, "done", tuple(directory / name for name in names), summary)
 
 
 def write_atomic(path: Path, text: str) -> None:
     """Write a small text file so that readers see the old or the new content, never a part."""
+    # Not tempfile: its files are private to the user, and results are to be shared like any other file.
+    draft = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile("w", dir=path.parent, prefix=f".{path.name}.", delete=False, encoding="utf-8") as file:
-            file.write(text)
-        os.replace(file.name, path)
+        draft.write_text(text, encoding="utf-8")
+        os.replace(draft, path)
     except OSError as error:
+        with contextlib.suppress(OSError):
+            draft.unlink()
         raise DeviceError(f"{path}: cannot write ({error.strerror}); check the folder and the free space") from error
+
+
+def _still_valid(stage: str, directory: Path, earlier: JsonObject, key: JsonObject) -> StageResult | None:
+    """The earlier result where it was made from the same key and its files still have the content it had written."""
+    outputs, summary = earlier.get("outputs"), earlier.get("summary")
+    if not isinstance(outputs, dict) or not isinstance(summary, dict):
+        return None
+    if any(earlier.get(name) != value for name, value in key.items()):
+        return None
+    if any(not (directory / name).is_file() or hash_file(directory / name) != digest for name, digest in outputs.items()):
+        return None
+    return StageResult(stage, "skipped", tuple(directory / name for name in outputs), summary)
 
 
 @contextlib.contextmanager
@@ -106,7 +129,7 @@ def _working_folder(stage: str, directory: Path) -> Iterator[Path]:
         directory.mkdir(parents=True, exist_ok=True)
         work = Path(tempfile.mkdtemp(prefix=f".{stage}.", dir=directory))
     except OSError as error:
-        raise DeviceError(f"{directory}: cannot write there ({error.strerror}); choose another --out") from error
+        raise DeviceError(f"{directory}: cannot write there ({error.strerror}); choose another folder with --out") from error
     try:
         yield work
     except OSError as error:

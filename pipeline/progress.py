@@ -24,3 +24,7 @@ class Progress:
         """One line for the person who watches."""
         if not self.quiet:
             tqdm.write(text, file=sys.stderr)
+
+    def warn(self, text: str) -> None:
+        """What must be seen also where `quiet` was asked for: a failure that did not stop the rest."""
+        tqdm.write(text, file=sys.stderr)

@@ -44,7 +44,9 @@ def read_table(path: Path, name: str) -> tuple[pa.Table, Frame]:
         version = metadata.get(b"cadence.version", b"").decode()
         frame = Frame(**json.loads(metadata.get(b"cadence.frame", b"{}")))
     except (pa.ArrowException, OSError, ValueError, TypeError) as error:
-        raise InputError(f"{path}: not a readable cadence table ({error}); run its stage again with --force") from error
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise InputError(f"{path}: not a readable cadence table ({reason}); run its stage again with --force") from error
     if kind != name or version != str(VERSION):
-        raise InputError(f"{path}: holds {kind or 'an unknown table'} version {version or '?'}, expected {name} version {VERSION}; run its stage again")
+        found = f"{kind or 'an unknown table'} version {version or '?'}"
+        raise InputError(f"{path}: holds {found}, expected {name} version {VERSION}; run its stage again")
     return table, frame

@@ -1,0 +1,154 @@
+"""Stages are atomic, skipped only when nothing changed, and never leave a mixture."""
+
+import json
+import os
+import stat
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from cadence.errors import DeviceError, InputError
+from pipeline.manifest import hash_file, manifest_path, read_manifest, run_stage, write_atomic
+
+
+@dataclass(frozen=True)
+class Config:
+    size: int = 1
+
+
+class Body:
+    """A stage body that counts its calls and writes what it was told to."""
+
+    def __init__(self, files=None, error=None):
+        self.files = {"a.txt": "A"} if files is None else files
+        self.error = error
+        self.calls = 0
+
+    def __call__(self, work: Path):
+        self.calls += 1
+        for name, text in self.files.items():
+            (work / name).write_text(text)
+        if self.error is not None:
+            raise self.error
+        return {"num_files": len(self.files)}
+
+
+@pytest.fixture
+def source(tmp_path):
+    path = tmp_path / "input.bin"
+    path.write_bytes(b"input")
+    return path
+
+
+def run(tmp_path, source, body, config=Config(), force=False):
+    return run_stage("demo", tmp_path / "mission", config=config, inputs=[source], body=body, force=force)
+
+
+def files_of(directory: Path) -> list[str]:
+    return sorted(path.name for path in directory.iterdir())
+
+
+def test_outputs_and_manifest_appear_together(tmp_path, source):
+    result = run(tmp_path, source, Body())
+    mission = tmp_path / "mission"
+    assert result.status == "done" and result.outputs == (mission / "a.txt",) and result.summary == {"num_files": 1}
+    assert files_of(mission) == ["a.txt", "demo.manifest.json"]
+    manifest = read_manifest("demo", mission)
+    assert manifest["inputs"] == {"input.bin": hash_file(source)}
+    assert manifest["outputs"] == {"a.txt": hash_file(mission / "a.txt")}
+    assert manifest["config"] == {"size": 1} and "torch" in manifest["versions"]
+
+
+def test_second_run_is_skipped_with_the_same_result(tmp_path, source):
+    body = Body()
+    first, second = run(tmp_path, source, body), run(tmp_path, source, body)
+    assert body.calls == 1 and second.status == "skipped"
+    assert (second.outputs, second.summary) == (first.outputs, first.summary)
+
+
+def test_anything_that_changed_runs_the_stage_again(tmp_path, source):
+    body = Body()
+    run(tmp_path, source, body)
+    assert run(tmp_path, source, body, force=True).status == "done"
+    assert run(tmp_path, source, body, config=Config(2)).status == "done"
+    source.write_bytes(b"other input")
+    assert run(tmp_path, source, body, config=Config(2)).status == "done"
+    (tmp_path / "mission" / "a.txt").write_text("changed by hand")
+    assert run(tmp_path, source, body, config=Config(2)).status == "done"
+    (tmp_path / "mission" / "a.txt").unlink()
+    assert run(tmp_path, source, body, config=Config(2)).status == "done"
+    manifest_path("demo", tmp_path / "mission").write_text("{ damaged")
+    assert run(tmp_path, source, body, config=Config(2)).status == "done"
+    manifest_path("demo", tmp_path / "mission").write_text("{}")
+    assert run(tmp_path, source, body, config=Config(2)).status == "done"
+    assert body.calls == 8
+
+
+@pytest.mark.parametrize("error", [InputError("bad log"), RuntimeError("defect"), KeyboardInterrupt()])
+def test_failure_leaves_nothing_behind(tmp_path, source, error):
+    with pytest.raises(type(error)):
+        run(tmp_path, source, Body(error=error))
+    assert files_of(tmp_path / "mission") == []
+
+
+def test_failure_leaves_the_earlier_result_alone(tmp_path, source):
+    run(tmp_path, source, Body({"a.txt": "old"}))
+    with pytest.raises(InputError):
+        run(tmp_path, source, Body({"a.txt": "new"}, InputError("bad")), force=True)
+    assert (tmp_path / "mission" / "a.txt").read_text() == "old"
+    assert run(tmp_path, source, Body()).status == "skipped"
+
+
+def test_files_only_the_earlier_run_wrote_are_removed(tmp_path, source):
+    run(tmp_path, source, Body({"a.txt": "A", "truth.txt": "T"}))
+    (tmp_path / "mission" / "other.txt").write_text("of another stage")
+    run(tmp_path, source, Body({"a.txt": "A2"}), config=Config(2))
+    assert files_of(tmp_path / "mission") == ["a.txt", "demo.manifest.json", "other.txt"]
+
+
+def test_absent_input_says_what_to_do(tmp_path):
+    with pytest.raises(InputError, match=r"gone\.bin: not found; .*stage that writes it"):
+        run(tmp_path, tmp_path / "gone.bin", Body())
+    with pytest.raises(InputError, match="cannot be read"):
+        run(tmp_path, tmp_path, Body())
+    assert not (tmp_path / "mission").exists()
+
+
+def test_unwritable_folder_is_one_line(tmp_path, source):
+    (tmp_path / "mission").write_text("a file where a folder should be")
+    with pytest.raises(DeviceError, match="cannot write there") as caught:
+        run(tmp_path, source, Body())
+    assert "\n" not in str(caught.value)
+
+
+def test_full_disk_is_a_device_error(tmp_path, source):
+    with pytest.raises(DeviceError, match="could not write its output"):
+        run(tmp_path, source, Body(error=OSError(28, "No space left on device")))
+
+
+def test_write_atomic_replaces_and_honours_the_umask(tmp_path):
+    path = tmp_path / "deep" / "x.json"
+    before = os.umask(0o022)
+    try:
+        write_atomic(path, "old")
+        write_atomic(path, "new")
+    finally:
+        os.umask(before)
+    assert path.read_text() == "new" and files_of(path.parent) == ["x.json"]
+    assert stat.S_IMODE(path.stat().st_mode) == 0o644
+
+
+def test_write_atomic_that_fails_leaves_no_draft(tmp_path):
+    (tmp_path / "x.json").mkdir()
+    with pytest.raises(DeviceError, match="cannot write"):
+        write_atomic(tmp_path / "x.json", "text")
+    assert files_of(tmp_path) == ["x.json"]
+
+
+def test_manifest_is_the_same_bytes_each_time(tmp_path, source):
+    run(tmp_path, source, Body())
+    first = manifest_path("demo", tmp_path / "mission").read_bytes()
+    run(tmp_path, source, Body(), force=True)
+    assert manifest_path("demo", tmp_path / "mission").read_bytes() == first
+    json.loads(first)
