@@ -1,0 +1,1 @@
+"""Rivals of the diffusion model: the same call, joint samples out."""

@@ -1,0 +1,36 @@
+"""Pure functions from hypotheses and truth to numbers. Everything is float64, and every mean respects the weights.
+
+Shapes everywhere: hypotheses position_m [B, K, A, T, 2], weight [B, K] (rows sum to one), truth_m [B, A, T, 2], is_known
+[B, A, T]. Functions of one step return [B, A, T]; what they hold where the truth is unknown is undefined (usually NaN).
+"""
+
+from cadence.metrics.bootstrap import Interval, bootstrap_mean, bootstrap_ratio
+from cadence.metrics.calibration import coverage, density_rank
+from cadence.metrics.motion import StepLengths, collision_share, step_length_statistics
+from cadence.metrics.position import ade, expected_distance, masked_mean, mean_error, min_ade, min_ade_distance, spread
+from cadence.metrics.scores import crps, energy_score, trajectory_energy_score
+from cadence.metrics.sets import Gospa, gospa, ospa
+
+__all__ = [
+    "Gospa",
+    "Interval",
+    "StepLengths",
+    "ade",
+    "bootstrap_mean",
+    "bootstrap_ratio",
+    "collision_share",
+    "coverage",
+    "crps",
+    "density_rank",
+    "energy_score",
+    "expected_distance",
+    "gospa",
+    "masked_mean",
+    "mean_error",
+    "min_ade",
+    "min_ade_distance",
+    "ospa",
+    "spread",
+    "step_length_statistics",
+    "trajectory_energy_score",
+]
