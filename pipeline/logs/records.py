@@ -1,0 +1,147 @@
+"""Records and chunks of an MCAP as bytes, read strictly: every foreign error becomes `DamagedRecord` here.
+
+The only place that calls the decompressors and the record parsers of `mcap`, so that the rest of the house knows one
+kind of damage. Sizes that a file declares are never believed before they are checked: a short file cannot make us
+allocate much.
+"""
+
+import contextlib
+import struct
+import zlib
+from collections.abc import Iterator
+from io import BytesIO
+from typing import Final
+
+import lz4.frame
+import zstandard
+from mcap import records
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import EndOfFile, McapError
+from mcap.opcode import Opcode
+
+MAGIC: Final = b"\x89MCAP0\r\n"
+HEAD: Final = struct.Struct("<BQ")
+"""Opcode and length in front of every record."""
+MESSAGE_HEAD: Final = struct.Struct("<HIQQ")
+"""Channel id, sequence, log time and publish time in front of the data of a message."""
+CHUNK_HEAD: Final = struct.Struct("<QQQII")
+"""Start time, end time, uncompressed size, CRC and length of the name of the compression."""
+MAX_CHUNK_BYTES: Final = 2**30
+"""Largest chunk that is decompressed; recorders write a few megabytes."""
+
+_FOREIGN = (
+    McapError, ValueError, struct.error, zstandard.ZstdError, RuntimeError, EOFError, OverflowError, MemoryError,
+)  # fmt: skip
+"""What `mcap`, zstandard, lz4 and struct raise on damage; CRCValidationError and UnicodeDecodeError are ValueErrors."""
+
+
+class DamagedRecord(Exception):
+    """A record that cannot be used; internal to the reading of logs, `str` says why."""
+
+
+@contextlib.contextmanager
+def damage() -> Iterator[None]:
+    """Turns whatever a parser or decompressor raises on bad bytes into `DamagedRecord`."""
+    try:
+        yield
+    except _FOREIGN as error:
+        raise DamagedRecord(str(error) or type(error).__name__) from error
+
+
+class StrictStream(ReadDataStream):
+    """A stream over one record which raises where `mcap` would return fewer bytes than were asked for."""
+
+    def __init__(self, body: bytes) -> None:
+        super().__init__(BytesIO(body))
+
+    def read(self, length: int) -> bytes:
+        """Exactly `length` bytes."""
+        data = super().read(length)
+        if len(data) != length:
+            raise EndOfFile
+        return data
+
+
+def parse_channel(body: bytes) -> records.Channel:
+    """The Channel record with this body; `DamagedRecord` where it is none."""
+    with damage():
+        record: records.Channel = records.Channel.read(StrictStream(body))
+    return record
+
+
+def parse_schema(body: bytes) -> records.Schema:
+    """The Schema record with this body; `DamagedRecord` where it is none."""
+    with damage():
+        record: records.Schema = records.Schema.read(StrictStream(body))
+    return record
+
+
+def parse_metadata(body: bytes) -> records.Metadata:
+    """The Metadata record with this body; `DamagedRecord` where it is none."""
+    with damage():
+        record: records.Metadata = records.Metadata.read(StrictStream(body))
+    return record
+
+
+def parse_chunk(body: bytes) -> records.Chunk:
+    """The Chunk record with this body, still compressed; `DamagedRecord` where its lengths contradict each other."""
+    with damage():
+        stream = StrictStream(body)
+        chunk: records.Chunk = records.Chunk.read(stream)
+    if stream.count != len(body):
+        raise DamagedRecord(f"{len(body) - stream.count} bytes too many in the chunk")
+    return chunk
+
+
+def index_count(body: bytes) -> tuple[int, int]:
+    """Channel id and number of messages in the MessageIndex record with this body."""
+    with damage():
+        channel_id, length = struct.unpack_from("<HI", body)
+    if length != len(body) - 6 or length % 16:
+        raise DamagedRecord("the lengths in a message index contradict each other")
+    return channel_id, length // 16
+
+
+def unpack_chunk(chunk: records.Chunk) -> bytes:
+    """The records inside `chunk`, CRC checked; `DamagedRecord` where anything is wrong with it."""
+    if chunk.uncompressed_size > MAX_CHUNK_BYTES:
+        raise DamagedRecord(f"it declares {chunk.uncompressed_size} bytes, more than the limit of {MAX_CHUNK_BYTES}")
+    with damage():
+        data = _decompress(chunk)
+    if chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc:
+        raise DamagedRecord("its checksum does not match")
+    if not chunk.uncompressed_crc and len(data) != chunk.uncompressed_size:
+        raise DamagedRecord(f"it holds {len(data)} bytes instead of {chunk.uncompressed_size}")
+    return data
+
+
+def _decompress(chunk: records.Chunk) -> bytes:
+    if chunk.compression == "":
+        return chunk.data
+    if chunk.uncompressed_size == 0 and not chunk.data:
+        return b""
+    if chunk.compression == "zstd":
+        declared = zstandard.frame_content_size(chunk.data)
+        if declared > MAX_CHUNK_BYTES:
+            raise DamagedRecord(f"its content declares {declared} bytes, more than the limit of {MAX_CHUNK_BYTES}")
+        return zstandard.ZstdDecompressor().decompress(chunk.data, max_output_size=chunk.uncompressed_size)
+    if chunk.compression == "lz4":
+        decompressor = lz4.frame.LZ4FrameDecompressor()
+        data: bytes = decompressor.decompress(chunk.data, max_length=chunk.uncompressed_size + 1)
+        return data
+    raise DamagedRecord(f"it uses the compression {chunk.compression!r}, which is not known")
+
+
+def walk(data: bytes) -> Iterator[tuple[int, int, int]]:
+    """Opcode, begin and end of the body of every record in `data`; `DamagedRecord` where the next one cannot be."""
+    position, size = 0, len(data)
+    while position < size:
+        if position + 9 > size:
+            raise DamagedRecord("its last record is cut off")
+        opcode, length = HEAD.unpack_from(data, position)
+        begin = position + 9
+        position = begin + length
+        # Opcode 0 does not exist; without this test megabytes of zeros would be walked nine bytes at a time.
+        if opcode == 0 or position > size or (opcode == Opcode.MESSAGE and length < MESSAGE_HEAD.size):
+            raise DamagedRecord("the lengths of the records inside contradict each other")
+        yield opcode, begin, position

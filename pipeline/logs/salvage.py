@@ -1,0 +1,441 @@
+"""One walk over all records of an MCAP which finds what is whole, skips what is broken, and counts what was lost.
+
+Every log is opened this way, sound or not: a sound one gives a plan that agrees with its statistics, a damaged one a
+plan of what is left. Chunks are decompressed one at a time and their CRCs checked; only the plan stays in memory.
+"""
+
+import bisect
+import re
+import struct
+import zlib
+from collections import Counter
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import BinaryIO, Final, TypeVar
+
+from mcap import records
+from mcap.opcode import Opcode
+
+from pipeline.logs.records import (
+    CHUNK_HEAD,
+    HEAD,
+    MAGIC,
+    MESSAGE_HEAD,
+    DamagedRecord,
+    StrictStream,
+    damage,
+    index_count,
+    parse_channel,
+    parse_chunk,
+    parse_metadata,
+    parse_schema,
+    unpack_chunk,
+    walk,
+)
+from pipeline.logs.summary import Summary, parse_summary_record, read_summary
+
+LOOSE_BLOCK_BYTES: Final = 2**20
+"""Messages outside chunks are planned in stretches of about this size."""
+_SEARCH_BYTES: Final = 2**20
+_MAX_SEARCH_BYTES: Final = 2**28
+_BELIEVED: Final = 3  # points that make a place believable after damage, see _Scanner._points
+_CANDIDATE: Final = re.compile(rb"[\x01-\x0f](?=[\x00-\xff]{5}\x00{3})")  # an opcode and a length below 2**40
+_Definition = TypeVar("_Definition", records.Channel, records.Schema)
+_MAX_SMALL_BYTES: Final = 2**26  # channels, schemas, metadata, message indexes; larger ones are not believed
+
+_CHECKS: Final[Mapping[int, Callable[[bytes], object]]] = {
+    Opcode.CHANNEL: parse_channel,
+    Opcode.SCHEMA: parse_schema,
+    Opcode.METADATA: parse_metadata,
+    Opcode.MESSAGE_INDEX: index_count,
+}
+
+
+@dataclass(frozen=True)
+class Block:
+    """A stretch of the file which holds messages: the body of a chunk record, or records outside chunks.
+
+    offset, length  bytes in the file; for loose records they begin with a record head, for chunks with the chunk's fields
+    num_messages    by channel id
+    """
+
+    offset: int
+    length: int
+    is_chunk: bool
+    start_ns: int
+    end_ns: int
+    is_sorted: bool
+    num_messages: Mapping[int, int]
+
+
+@dataclass(frozen=True)
+class Loss:
+    """A part of the file that could not be used; `span_ns` and `num_messages` where they are known."""
+
+    offset: int
+    reason: str
+    span_ns: tuple[int, int] | None = None
+    num_messages: int | None = None
+
+
+@dataclass
+class Plan:
+    """What a log holds and what it has lost; filled by `scan_log`."""
+
+    blocks: list[Block] = field(default_factory=list)
+    channels: dict[int, records.Channel] = field(default_factory=dict)
+    schemas: dict[int, records.Schema] = field(default_factory=dict)
+    metadata_spans: list[tuple[int, int]] = field(default_factory=list)
+    losses: list[Loss] = field(default_factory=list)
+    remarks: list[str] = field(default_factory=list)
+    """Faults by which no message is lost."""
+    doubts: list[str] = field(default_factory=list)
+    """Faults by which messages may be lost or wrong, without a place in the file."""
+    summary: Summary | None = None
+    library: str = ""
+    reached_end: bool = False
+    has_checksums: bool = True
+
+    @property
+    def num_messages(self) -> int:
+        """Messages in the blocks, also those of channels without definition."""
+        return sum(sum(block.num_messages.values()) for block in self.blocks)
+
+
+def scan_log(path: Path, size: int, on_bytes: Callable[[int], None] | None = None) -> Plan:
+    """Walk the whole file; OSError is the caller's."""
+    with path.open("rb") as file:
+        scanner = _Scanner(file, size, on_bytes)
+        scanner.run()
+        return scanner.plan
+
+
+class _Scanner:
+    def __init__(self, file: BinaryIO, size: int, on_bytes: Callable[[int], None] | None) -> None:
+        self.file, self.size, self.on_bytes = file, size, on_bytes
+        self.plan = Plan()
+        self.plan.summary, fault = read_summary(file, size)
+        if fault:
+            self.plan.remarks.append(fault)
+        self.places = self.plan.summary.places if self.plan.summary else []
+        self.limit = self.plan.summary.data_end if self.plan.summary else size
+        self.crc = 0
+        self.position = self.reported = 0
+        self.loose = _LooseRun()
+        self.previous = 0  # opcode of the record before: a message index follows a chunk or another one
+        self.broken_chunk: int | None = None  # index of the loss of the chunk just before, to be counted by its indexes
+        self.num_unknown = 0
+        self.seen: dict[bytes, None] = {}
+
+    def run(self) -> None:
+        """Fill the plan."""
+        self.crc = zlib.crc32(self._read(0, len(MAGIC)))
+        self.position = len(MAGIC)
+        while self.position < self.limit and not self.plan.reached_end:
+            try:
+                self._record()
+            except DamagedRecord as error:
+                self._resume(str(error))
+            if self.on_bytes is not None:
+                self.on_bytes(self.position - self.reported)
+                self.reported = self.position
+        self._flush_loose()
+        if self.on_bytes is not None:
+            self.on_bytes(self.size - self.reported)
+        self._cross_check()
+
+    def _read(self, offset: int, length: int) -> bytes:
+        self.file.seek(offset)
+        data = self.file.read(length)
+        if len(data) != length:
+            raise DamagedRecord("the file ends inside a record")
+        return data
+
+    def _record(self) -> None:
+        """Take the record at the position, or raise without having moved."""
+        offset = self.position
+        head = self._read(offset, HEAD.size)
+        opcode, length = HEAD.unpack(head)
+        end = offset + HEAD.size + length
+        if opcode == 0 or end > self.limit:
+            raise DamagedRecord("the file ends inside a record" if opcode else "there is no such record")
+        if opcode != Opcode.MESSAGE_INDEX:
+            self.broken_chunk = None
+        body = self._take(opcode, offset + HEAD.size, length)
+        if not self.plan.reached_end:
+            self.crc = zlib.crc32(head, self.crc)
+            if body is None:
+                self._crc_of_rest(offset + HEAD.size, length)
+            else:
+                self.crc = zlib.crc32(body, self.crc)
+        self.previous, self.position = opcode, end
+
+    def _crc_of_rest(self, offset: int, length: int) -> None:
+        for begin in range(offset, offset + length, _SEARCH_BYTES):
+            self.crc = zlib.crc32(self._read(begin, min(_SEARCH_BYTES, offset + length - begin)), self.crc)
+
+    def _take(self, opcode: int, offset: int, length: int) -> bytes | None:
+        """Plan the record; its body where it was read."""
+        if opcode in (Opcode.MESSAGE, Opcode.CHANNEL, Opcode.SCHEMA, Opcode.MESSAGE_INDEX, Opcode.METADATA, Opcode.HEADER):
+            if opcode != Opcode.MESSAGE and length > _MAX_SMALL_BYTES:
+                raise DamagedRecord("a record is impossibly long")
+            return self._take_small(opcode, offset, self._read(offset, length))
+        self._flush_loose()
+        if opcode == Opcode.CHUNK:
+            body = self._read(offset, length)
+            self._take_chunk(offset, body)
+            return body
+        if opcode == Opcode.DATA_END:
+            self._take_data_end(offset, self._read(offset, length))
+        elif opcode == Opcode.ATTACHMENT:
+            self._check_attachment(offset, length)
+        elif opcode <= Opcode.DATA_END:
+            parse_summary_record(opcode, self._read(offset, length))
+            self.plan.doubts.append("The end mark of the data is missing.")
+            self.plan.reached_end = True
+        else:
+            self.num_unknown += 1  # private or future records are to be skipped, unless damage made them
+        return None
+
+    def _take_small(self, opcode: int, offset: int, body: bytes) -> bytes:
+        if opcode == Opcode.MESSAGE:
+            if len(body) < MESSAGE_HEAD.size:
+                raise DamagedRecord("a message is too short")
+            channel_id, _, log_time, _ = MESSAGE_HEAD.unpack_from(body)
+            self.loose.add(offset - HEAD.size, offset + len(body), channel_id, log_time)
+            if self.loose.end - self.loose.begin > LOOSE_BLOCK_BYTES:
+                self._flush_loose()
+            return body
+        if opcode in (Opcode.CHANNEL, Opcode.SCHEMA):
+            self._define(opcode, body)
+            return body
+        self._flush_loose()
+        if opcode == Opcode.MESSAGE_INDEX:
+            if self.previous not in (Opcode.CHUNK, Opcode.MESSAGE_INDEX):
+                self.plan.doubts.append(f"At byte {offset}: a message index without the chunk that it belongs to.")
+            _, count = index_count(body)
+            if self.broken_chunk is not None:
+                loss = self.plan.losses[self.broken_chunk]
+                known = (loss.num_messages or 0) + count
+                self.plan.losses[self.broken_chunk] = Loss(loss.offset, loss.reason, loss.span_ns, known)
+        elif opcode == Opcode.METADATA:
+            parse_metadata(body)
+            self.plan.metadata_spans.append((offset, len(body)))
+        elif self.previous == 0:
+            self.plan.library = _library(body)
+        return body
+
+    def _take_chunk(self, offset: int, body: bytes) -> None:
+        chunk = parse_chunk(body)
+        if not chunk.uncompressed_crc and body:
+            self.plan.has_checksums = False
+        try:
+            block = self._block_of_chunk(offset, len(body), unpack_chunk(chunk))
+        except DamagedRecord as error:
+            span = self._span(offset - HEAD.size, chunk.message_start_time, chunk.message_end_time)
+            self.plan.losses.append(Loss(offset - HEAD.size, str(error), span))
+            self.broken_chunk = len(self.plan.losses) - 1
+        else:
+            if block.num_messages:
+                self.plan.blocks.append(block)
+
+    def _block_of_chunk(self, offset: int, length: int, data: bytes) -> Block:
+        counts: Counter[int] = Counter()
+        first, last, previous, is_sorted = 2**64, -1, -1, True
+        definitions = []
+        unpack = MESSAGE_HEAD.unpack_from
+        for opcode, begin, end in walk(data):
+            if opcode == Opcode.MESSAGE:
+                channel_id, _, log_time, _ = unpack(data, begin)
+                counts[channel_id] += 1
+                is_sorted = is_sorted and log_time >= previous
+                previous = log_time
+                first, last = min(first, log_time), max(last, log_time)
+            elif opcode in (Opcode.CHANNEL, Opcode.SCHEMA):
+                definitions.append((opcode, data[begin:end]))
+        for opcode, body in definitions:  # only now: a chunk whose end is broken must not leave half of itself behind
+            self._define(opcode, body)
+        return Block(offset, length, True, first, last, is_sorted, dict(counts))
+
+    def _define(self, opcode: int, body: bytes) -> None:
+        """Take a channel or schema; a second definition that differs is reported, the first stays."""
+        key = bytes([opcode]) + body
+        if key in self.seen:
+            return
+        self.seen[key] = None
+        if opcode == Opcode.CHANNEL:
+            channel = parse_channel(body)
+            if self.plan.channels.setdefault(channel.id, channel) != channel:
+                self.plan.doubts.append(f"Channel {channel.id} ({channel.topic}) is defined twice, differently.")
+        else:
+            schema = parse_schema(body)
+            if self.plan.schemas.setdefault(schema.id, schema) != schema:
+                self.plan.doubts.append(f"Schema {schema.id} ({schema.name}) is defined twice, differently.")
+
+    def _take_data_end(self, offset: int, body: bytes) -> None:
+        if len(body) != 4:
+            raise DamagedRecord("the end mark of the data is too long")
+        following = offset + 4
+        if self.plan.summary is not None and following != self.limit:
+            raise DamagedRecord("an end mark of the data lies where none belongs")
+        (expected,) = struct.unpack("<I", body)
+        if expected not in (0, self.crc) and not self.plan.losses:
+            place = "outside the chunks" if self.plan.has_checksums else "somewhere"
+            self.plan.doubts.append(f"The checksum over all data does not match: something was changed {place}.")
+        has_loose = any(not block.is_chunk for block in self.plan.blocks)
+        self.plan.has_checksums = expected != 0 or (self.plan.has_checksums and not has_loose)
+        self.plan.reached_end = True
+
+    def _check_attachment(self, offset: int, length: int) -> None:
+        if length < 28:
+            raise DamagedRecord("an attachment is too short")
+
+    def _flush_loose(self) -> None:
+        run, self.loose = self.loose, _LooseRun()
+        if run.begin >= 0:
+            self.plan.blocks.append(run.block())
+
+    def _span(self, offset: int, start: int, end: int) -> tuple[int, int] | None:
+        """The time span of the chunk at `offset`: from the index where there is one, else from its own header."""
+        index = self.plan.summary.chunks.get(offset) if self.plan.summary else None
+        if index is not None:
+            return index.message_start_time, index.message_end_time
+        return (start, end) if 0 < start <= end < 2**63 else None
+
+    def _resume(self, reason: str) -> None:
+        """After damage at the position: note the loss, go on at the next place that can be believed."""
+        self._flush_loose()
+        offset = self.position
+        index = self.plan.summary.chunks.get(offset) if self.plan.summary else None
+        span = (index.message_start_time, index.message_end_time) if index else self._header_span(offset)
+        following = bisect.bisect_right(self.places, offset)
+        if following < len(self.places):
+            self.position = self.places[following]
+        else:
+            self.position = self._find_records(offset + 1)
+        where = f"bytes {offset} to {self.position}" if self.position < self.limit else f"everything from byte {offset} on"
+        self.plan.losses.append(Loss(offset, f"{reason}; {where} skipped", span))
+        self.previous = Opcode.CHUNK  # whatever lay there may have been a chunk with its indexes
+        self.broken_chunk = len(self.plan.losses) - 1 if index else None
+
+    def _find_records(self, begin: int) -> int:
+        """The next place after `begin` where a chain of plausible records starts; the end of the data where there is none."""
+        stop = min(self.limit, begin + _MAX_SEARCH_BYTES)
+        for window in range(begin, stop, _SEARCH_BYTES):
+            self.file.seek(window)
+            data = self.file.read(_SEARCH_BYTES + HEAD.size - 1)
+            for match in _CANDIDATE.finditer(data):
+                _, length = HEAD.unpack_from(data, match.start())
+                offset = window + match.start()
+                if offset + HEAD.size + length <= self.limit and self._is_believable(offset):
+                    return offset
+        return self.limit
+
+    def _is_believable(self, offset: int) -> bool:
+        """Whether plausible records follow each other from `offset` on, enough of them or up to the end."""
+        points = 0
+        while points < _BELIEVED and offset < self.limit:
+            try:
+                head = self._read(offset, HEAD.size)
+                opcode, length = HEAD.unpack(head)
+                points += self._points(opcode, offset + HEAD.size, length)
+            except DamagedRecord:
+                return False
+            if opcode == Opcode.DATA_END:
+                return points > 1
+            offset += HEAD.size + length
+        return points >= _BELIEVED or offset == self.limit
+
+    def _points(self, opcode: int, offset: int, length: int) -> int:
+        """How much the record at `offset` speaks for real records: 2 where lengths inside agree with the outer one."""
+        if offset + length > self.limit:
+            raise DamagedRecord("too long")
+        if opcode == Opcode.MESSAGE and length >= MESSAGE_HEAD.size:
+            (channel_id,) = struct.unpack("<H", self._read(offset, 2))
+            if channel_id in self.plan.channels:
+                return 1
+        elif opcode == Opcode.CHUNK and length >= CHUNK_HEAD.size + 8:
+            name_length = CHUNK_HEAD.unpack(self._read(offset, CHUNK_HEAD.size))[-1]
+            if name_length + CHUNK_HEAD.size + 8 <= length:
+                (data_length,) = struct.unpack("<Q", self._read(offset + CHUNK_HEAD.size + name_length, 8))
+                if data_length == length - CHUNK_HEAD.size - name_length - 8:
+                    return 2
+        elif length <= _MAX_SMALL_BYTES and opcode in _CHECKS:
+            _CHECKS[opcode](self._read(offset, length))
+            return 2
+        elif opcode == Opcode.DATA_END and length == 4:
+            return 1
+        raise DamagedRecord("not a record")
+
+    def _header_span(self, offset: int) -> tuple[int, int] | None:
+        """The time span in the header of a chunk that is cut off."""
+        self.file.seek(offset)
+        data = self.file.read(HEAD.size + CHUNK_HEAD.size)
+        if len(data) < HEAD.size + CHUNK_HEAD.size or data[0] != Opcode.CHUNK:
+            return None
+        start, end, *_ = CHUNK_HEAD.unpack_from(data, HEAD.size)
+        return (start, end) if 0 < start <= end < 2**63 else None
+
+    def _cross_check(self) -> None:
+        """Compare with what the summary says."""
+        plan, summary = self.plan, self.plan.summary
+        if not plan.reached_end and not plan.losses:
+            plan.doubts.append("The file ends without its end mark: the recording was cut off.")
+        if summary is None or summary.statistics is None:
+            if self.num_unknown:
+                plan.doubts.append(f"{self.num_unknown} unknown records were skipped; no statistics tell whether any mattered.")
+        if summary is None:
+            return
+        plan.doubts += _prefer_index("Channel", plan.channels, summary.channels)
+        plan.doubts += _prefer_index("Schema", plan.schemas, summary.schemas)
+        seen = {loss.offset for loss in plan.losses} | {block.offset - HEAD.size for block in plan.blocks if block.is_chunk}
+        for offset, index in summary.chunks.items():
+            if offset not in seen and index.message_index_offsets:
+                span = (index.message_start_time, index.message_end_time)
+                plan.losses.append(Loss(offset, "the chunk that the index names is not there", span))
+
+
+def _prefer_index(kind: str, known: dict[int, _Definition], indexed: Mapping[int, _Definition]) -> list[str]:
+    """Put the definitions of the index into `known`: it has a checksum, records outside chunks have none."""
+    doubts = []
+    for number, record in indexed.items():
+        if known.setdefault(number, record) != record:
+            doubts.append(f"{kind} {number} differs between the data and the index; the index was used.")
+            known[number] = record
+    return doubts
+
+
+def _library(body: bytes) -> str:
+    """Who wrote the file, from its header; empty where that cannot be read."""
+    try:
+        with damage():
+            return str(records.Header.read(StrictStream(body)).library)
+    except DamagedRecord:
+        return ""
+
+
+@dataclass
+class _LooseRun:
+    """Consecutive records outside chunks, until they make a block."""
+
+    begin: int = -1
+    end: int = -1
+    first: int = 2**64
+    last: int = -1
+    previous: int = -1
+    is_sorted: bool = True
+    counts: Counter[int] = field(default_factory=Counter)
+
+    def add(self, begin: int, end: int, channel_id: int, log_time: int) -> None:
+        if self.begin < 0:
+            self.begin = begin
+        self.end = end
+        self.counts[channel_id] += 1
+        self.is_sorted = self.is_sorted and log_time >= self.previous
+        self.previous = log_time
+        self.first, self.last = min(self.first, log_time), max(self.last, log_time)
+
+    def block(self) -> Block:
+        """The block of the records so far."""
+        return Block(self.begin, self.end - self.begin, False, self.first, self.last, self.is_sorted, dict(self.counts))
