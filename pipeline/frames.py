@@ -1,0 +1,61 @@
+"""Geodetic positions ↔ the mission frame's metres (x east, y north).
+
+The projection is azimuthal equidistant (`+proj=aeqd`) on WGS 84 about the mission's datum. It has no zones, no central
+scale factor and no singularity inside a mission: distances and bearings from the datum are exact on the ellipsoid, and a
+circle about the datum is stretched by c / sin(c) with c = distance / earth radius, that is by distance² / (6 R²): 1e-5 at
+50 km (1 cm in a kilometre), 4e-5 at 100 km, 1e-3 at 500 km. Universal Transverse Mercator is off by 4e-4 at its very centre
+and tears missions at zone edges; a tangent plane shortens distances by distance² / (2 R²), and drops below the horizon.
+Covariances stated in local east and north are used as they are: their axes turn against the frame's by the convergence of
+the meridians, about (longitude difference) · sin(latitude): 0.5° at 50 km and 50° latitude.
+"""
+
+import numpy as np
+import numpy.typing as npt
+from pyproj import Transformer
+
+from cadence.errors import ConfigError, InputError
+from pipeline.tables import Frame
+
+FloatArray = npt.NDArray[np.float64]
+
+GEOREFERENCED_FRAME_ID = "mission"
+DEFAULT_FRAME_ID = "map"
+DATUM_DECIMALS = 4
+"""The datum is rounded to 1e-4 degrees (11 m): easy to state, and equal for small changes of the input."""
+
+
+def georeferenced_frame(latitude_deg: FloatArray, longitude_deg: FloatArray, datum: tuple[float, float] | None = None) -> Frame:
+    """The mission frame about `datum` (latitude, longitude; degrees), or about the median of the positions [N].
+
+    Raises `ConfigError` for a datum that is not on earth, `InputError` without any position.
+    """
+    if datum is not None:
+        if not (abs(datum[0]) <= 90 and abs(datum[1]) <= 180):
+            raise ConfigError(f"extract.datum = {list(datum)}: expected [latitude, longitude] in degrees")
+        return Frame(GEOREFERENCED_FRAME_ID, datum[0], datum[1])
+    if latitude_deg.size == 0:
+        raise InputError("no position in latitude and longitude to choose a datum from; set extract.datum")
+    # Longitudes are counted from the first one, so that a mission across 180° has its middle there, not at 0°.
+    offset = (longitude_deg - longitude_deg[0] + 180.0) % 360.0 - 180.0
+    longitude = (float(longitude_deg[0] + np.median(offset)) + 180.0) % 360.0 - 180.0
+    latitude = round(float(np.median(latitude_deg)), DATUM_DECIMALS)
+    return Frame(GEOREFERENCED_FRAME_ID, latitude, round(longitude, DATUM_DECIMALS))
+
+
+def to_local(frame: Frame, latitude_deg: FloatArray, longitude_deg: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """x_m (east) and y_m (north) in `frame` of positions [N] in degrees."""
+    x_m, y_m = _transformer(frame).transform(longitude_deg, latitude_deg)
+    return np.asarray(x_m, dtype=np.float64), np.asarray(y_m, dtype=np.float64)
+
+
+def to_geodetic(frame: Frame, x_m: FloatArray, y_m: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """latitude_deg and longitude_deg of positions [N] in `frame`."""
+    longitude, latitude = _transformer(frame).transform(x_m, y_m, direction="INVERSE")
+    return np.asarray(latitude, dtype=np.float64), np.asarray(longitude, dtype=np.float64)
+
+
+def _transformer(frame: Frame) -> Transformer:
+    if not frame.is_georeferenced:
+        raise InputError(f"the mission frame {frame.frame_id!r} has no datum to get latitude and longitude from; set extract.datum")
+    local = f"+proj=aeqd +lat_0={frame.latitude_deg!r} +lon_0={frame.longitude_deg!r} +datum=WGS84 +units=m +no_defs"
+    return Transformer.from_crs("EPSG:4326", local, always_xy=True)
