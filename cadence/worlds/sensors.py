@@ -1,0 +1,133 @@
+"""How sensors see and how they move: detection laws, measurement noise, search patterns."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cadence.worlds.terrain import Array
+
+FALSE_ALARM = 1e-4
+"""Probability of false alarm that the detection law of a radar is set to."""
+
+
+@dataclass(frozen=True)
+class SensorKind:
+    """What one make of sensor does.
+
+    range_m      distance at which the echo of a target at cruising speed crosses the threshold in half of the scans
+    scan_share   share of the steps in which it looks at a target at all: sea clutter, other work, the antenna elsewhere
+    range_sigma_m, bearing_sigma_rad  noise along and, times the distance, across the line of sight
+    needs_sight  whether land hides targets from it
+    """
+
+    name: str
+    range_m: float
+    scan_share: float
+    range_sigma_m: float
+    bearing_sigma_rad: float
+    needs_sight: bool
+
+
+def swerling_probability(distance_m: Array, half_range_m: Array) -> Array:
+    """Detection probability of a fluctuating target in one scan, 0.5 at `half_range_m`, 0 beyond 2.5 times that.
+
+    Swerling I: P = P_fa ** (1 / (1 + SNR)), SNR ~ distance ** -4 (Skolnik, Introduction to Radar Systems, chapter 2).
+    """
+    snr_at_half = math.log(FALSE_ALARM) / math.log(0.5) - 1.0
+    ratio = np.maximum(distance_m, 1.0) / half_range_m
+    probability = FALSE_ALARM ** (1.0 / (1.0 + snr_at_half * ratio**-4.0))
+    return np.where(ratio <= 2.5, probability, 0.0)
+
+
+def linear_probability(distance_m: Array, certain_range_m: Array) -> Array:
+    """Detection probability 1 up to `certain_range_m`, falling linearly to 0 at three times that (the Prison Escape law)."""
+    return np.clip(1.5 - 0.5 * distance_m / certain_range_m, 0.0, 1.0)
+
+
+def measurement_covariance(offset_m: Array, range_sigma_m: Array, bearing_sigma_rad: Array) -> Array:
+    """Covariance [..., 2, 2] of a position measured in range and bearing along `offset_m` [..., 2] (target minus sensor).
+
+    First order in the bearing's noise; never narrower across than a tenth of the noise along.
+    """
+    distance = np.hypot(offset_m[..., 0], offset_m[..., 1])
+    along = offset_m / np.maximum(distance, 1.0)[..., None]
+    across = np.stack([-along[..., 1], along[..., 0]], axis=-1)
+    across_sigma = np.maximum(distance * bearing_sigma_rad, 0.1 * range_sigma_m)
+    near = (distance < 1.0)[..., None, None]
+    covariance = (
+        along[..., :, None] * along[..., None, :] * (range_sigma_m**2)[..., None, None]
+        + across[..., :, None] * across[..., None, :] * (across_sigma**2)[..., None, None]
+    )
+    return np.where(near, np.eye(2) * (range_sigma_m**2)[..., None, None], covariance)
+
+
+def draw_noise(covariance_m2: Array, rng: np.random.Generator) -> Array:
+    """One normal draw [N, 2] of each covariance [N, 2, 2]."""
+    white = rng.standard_normal((*covariance_m2.shape[:-2], 2))
+    noise: Array = (np.linalg.cholesky(covariance_m2) @ white[..., None])[..., 0]
+    return noise
+
+
+@dataclass(frozen=True)
+class Sortie:
+    """How an aircraft works: lanes across the map at `speed_mps`, `on_station_s` long, then `turnaround_s` on the ground."""
+
+    speed_mps: float = 65.0
+    lane_m: float = 6000.0
+    on_station_s: float = 2000.0
+    turnaround_s: float = 900.0
+
+
+def sweep_track(rng: np.random.Generator, time_s: Array, side_m: float, sortie: Sortie) -> tuple[Array, NDArray[np.bool_]]:
+    """Positions [T, 2] of an aircraft that sweeps the map in parallel lanes, and whether it is in the air [T].
+
+    It starts at a base at the edge of the map at a random time of its cycle, flies lanes in a random direction each
+    sortie, and goes home by the straight way.
+    """
+    base = side_m / 2 * _on_square(rng.uniform(0.0, 2 * np.pi))
+    clock = -rng.uniform(0.0, sortie.on_station_s + sortie.turnaround_s)
+    knots_s, knots_m = [clock - 1.0], [base]
+    is_flying = np.zeros(len(time_s), dtype=bool)
+    while clock < time_s[-1]:
+        lanes = _lanes(rng, side_m, sortie.lane_m)
+        if np.hypot(*(lanes[0] - base)) > np.hypot(*(lanes[-1] - base)):
+            lanes = lanes[::-1]
+        path = np.vstack([base, lanes])
+        travelled = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(path, axis=0).T))])
+        far = min(travelled[-1], sortie.speed_mps * sortie.on_station_s)
+        turning = np.array([np.interp(far, travelled, path[:, axis]) for axis in (0, 1)])
+        path = np.vstack([path[travelled < far], turning, base])
+        arrival = clock + np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(path, axis=0).T))]) / sortie.speed_mps
+        is_flying |= (time_s >= clock) & (time_s < arrival[-1])
+        knots_s += [*arrival, arrival[-1] + sortie.turnaround_s]
+        knots_m += [*path, base]
+        clock = arrival[-1] + sortie.turnaround_s
+    track = np.stack([np.interp(time_s, knots_s, np.array(knots_m)[:, axis]) for axis in (0, 1)], axis=-1)
+    return track, is_flying
+
+
+def square_search(centre_m: Array, spacing_m: float, num_legs: int = 12) -> Array:
+    """Corners [P, 2] of an expanding square around a last known position (IAMSAR manual, pattern SS)."""
+    directions = np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
+    lengths = spacing_m * (1 + np.arange(num_legs) // 2)
+    legs = directions[np.arange(num_legs) % 4] * lengths[:, None]
+    return np.vstack([centre_m, centre_m + np.cumsum(legs, axis=0)])
+
+
+def _on_square(bearing: float) -> Array:
+    """The point [2] of the unit square's edge in a direction."""
+    direction = np.array([np.cos(bearing), np.sin(bearing)])
+    point: Array = direction / np.abs(direction).max()
+    return point
+
+
+def _lanes(rng: np.random.Generator, side_m: float, lane_m: float) -> Array:
+    """Ends [P, 2] of parallel lanes over the whole map, to and fro, in a random direction and with a random offset."""
+    offset = np.arange(-side_m / 2 + rng.uniform(0.2, 1.0) * lane_m, side_m / 2, lane_m)
+    reach = 0.46 * side_m
+    ends = np.stack([np.tile([-reach, reach, reach, -reach], len(offset))[: 2 * len(offset)], np.repeat(offset, 2)], axis=1)
+    turn = 0.5 * np.pi * rng.integers(4) + rng.uniform(-0.25, 0.25)
+    rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    return np.clip(ends @ rotation.T, -side_m / 2, side_m / 2)
