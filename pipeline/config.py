@@ -45,6 +45,35 @@ def load_tables(path: Path | None, overrides: Sequence[str] = ()) -> dict[str, d
     return tables
 
 
+def stage_config(
+    cls: type[T], table: str | None, path: Path | None, overrides: Sequence[str] = (), seed: int | None = None
+) -> T:
+    """The configuration `cls` of one command, from its `table` of the file at `path` and from `overrides`.
+
+    Without `table` the fields of `cls` are tables themselves. `seed` replaces every seed in it.
+    """
+    tables = load_tables(path, overrides)
+    names = {field.name for field in dataclasses.fields(cls)}  # type: ignore[arg-type]
+    config = (
+        read_config(cls, {name: value for name, value in tables.items() if name in names}, "")
+        if table is None
+        else read_config(cls, tables.get(table, {}), table)
+    )
+    return config if seed is None else with_seed(config, seed)
+
+
+def with_seed(config: T, seed: int) -> T:
+    """A copy of a configuration in which every field called `seed`, at any depth, has the value `seed`."""
+    changes: dict[str, Any] = {}
+    for field in dataclasses.fields(config):  # type: ignore[arg-type]
+        value = getattr(config, field.name)
+        if field.name == "seed":
+            changes["seed"] = seed
+        elif dataclasses.is_dataclass(value) and not isinstance(value, type):
+            changes[field.name] = with_seed(value, seed)
+    return dataclasses.replace(config, **changes)  # type: ignore[type-var]
+
+
 def parse_override(text: str) -> tuple[tuple[str, ...], Any]:
     """`a.b=value` as (("a", "b"), value); the value is TOML, or a bare string where it is not TOML."""
     key, separator, value = text.partition("=")
@@ -82,7 +111,7 @@ def read_config(cls: type[T], tables: Mapping[str, Any], where: str = "config") 
     if unknown:
         raise ConfigError(f"{where}: unknown key {unknown[0]!r}; known keys: {', '.join(fields)}")
     hints = typing.get_type_hints(cls)
-    values = {key: _convert(hints[key], value, f"{where}.{key}") for key, value in tables.items()}
+    values = {key: _convert(hints[key], value, f"{where}.{key}".lstrip(".")) for key, value in tables.items()}
     missing = [
         name
         for name, field in fields.items()

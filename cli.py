@@ -1,0 +1,295 @@
+"""The command line: flags to one call into `pipeline` to an exit code. No logic; heavy imports wait for their command."""
+
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from cadence.errors import CadenceError, UsageError
+from pipeline.config import stage_config
+from pipeline.manifest import StageResult
+from pipeline.missions import mission_directories
+from pipeline.progress import Progress
+from pipeline.summaries import log_record, log_summary, stage_summary, to_json
+
+EXIT_INTERRUPTED = 130
+
+app = typer.Typer(
+    name="cadence",
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 120},
+    help="""From mission logs in which targets are seen only now and then to weighted joint tracks, past and future.
+
+    \b
+      cadence info LOG.mcap                 what is in a log, and the settings that fit it
+      cadence run LOG.mcap --out results    everything: side file for Foxglove, layout, report
+      cadence COMMAND --help                options and examples of one command
+
+    Exit codes: 0 ok, 1 defect, 2 wrong call, 3 unusable input, 4 configuration, 5 device or storage, 6 quality gate,
+    130 interrupted.
+    """,
+)
+
+Log = Annotated[Path, typer.Argument(metavar="LOG", help="Mission log (MCAP).", show_default=False)]
+Logs = Annotated[list[Path], typer.Argument(metavar="LOG...", help="Mission logs (MCAP).", show_default=False)]
+Mission = Annotated[
+    Path, typer.Argument(metavar="MISSION", help="Mission directory, as written by ingest or run.", show_default=False)
+]
+Out = Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the results; made where it is absent.")]
+Config = Annotated[
+    Path | None, typer.Option("--config", metavar="FILE", help="TOML file with one table a stage (docs/configuration.md).")
+]
+Set = Annotated[
+    list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="One setting, as in infer.num_hypotheses=50; repeatable.")
+]
+Force = Annotated[bool, typer.Option("--force", help="Do it again even where nothing has changed.")]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress on stderr; errors only.")]
+Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON on stdout.")]
+Seed = Annotated[
+    int | None, typer.Option("--seed", metavar="N", help="Seed of everything random; the same seed repeats the result.")
+]
+
+
+@app.callback(invoke_without_command=True)
+def _root(version: Annotated[bool, typer.Option("--version", help="Print versions and leave.")] = False) -> None:
+    if version:
+        from pipeline.provenance import versions
+
+        typer.echo(", ".join(f"{name} {number}" for name, number in versions().items()))
+        raise typer.Exit
+
+
+@app.command()
+def info(log: Log, as_json: Json = False) -> None:
+    r"""Show what is in a log, and the settings that fit it.
+
+    Channels, schemas, rates, time range, health; which channels look like detections, truth, frames or obstacles.
+
+    \b
+    Examples:
+      cadence info flight.mcap
+      cadence info flight.mcap --json
+    """
+    from pipeline.info import describe_log, render
+
+    description = describe_log(log)
+    typer.echo(to_json(description) if as_json else render(description))
+
+
+@app.command()
+def run(
+    logs: Logs, out: Out, config: Config = None, settings: Set = None, seed: Seed = None, force: Force = False,
+    quiet: Quiet = False, as_json: Json = False,
+) -> int:  # fmt: skip
+    r"""Run all stages on every log.
+
+    Ingest, extract, infer, export, report; finished stages are skipped. Each log gets the mission directory
+    DIR/<name of the log>. One bad log does not stop the others.
+
+    \b
+    Examples:
+      cadence run flight.mcap --out results
+      cadence run logs/*.mcap --out results --config ships.toml --json
+      cadence run flight.mcap --out results --set infer.num_hypotheses=50 --seed 7
+    """
+    from pipeline.run import RunConfig, exit_code
+    from pipeline.run import run as run_all
+
+    resolved = stage_config(RunConfig, None, config, settings or (), seed)
+    results = run_all(logs, out, resolved, Progress(quiet), force)
+    typer.echo(to_json([log_record(result) for result in results]) if as_json else log_summary(results))
+    for result in results:
+        if result.error is not None:
+            _complain(result.error)
+    return exit_code(results)
+
+
+@app.command()
+def ingest(
+    log: Log, out: Out, config: Config = None, settings: Set = None, force: Force = False, quiet: Quiet = False,
+    as_json: Json = False,
+) -> None:  # fmt: skip
+    r"""Stage 1: catalogue a log.
+
+    Channels, rates, health and a suggested mapping go into the mission directory DIR/<name of the log>.
+
+    \b
+    Example:
+      cadence ingest flight.mcap --out results
+    """
+    from pipeline.ingest import IngestConfig
+    from pipeline.ingest import ingest as stage
+
+    directory = mission_directories([log], out)[log]
+    _show(stage(log, directory, stage_config(IngestConfig, "ingest", config, settings or ()), Progress(quiet), force), as_json)
+
+
+@app.command()
+def extract(
+    mission: Mission, config: Config = None, settings: Set = None, seed: Seed = None, force: Force = False,
+    quiet: Quiet = False, as_json: Json = False,
+) -> None:  # fmt: skip
+    r"""Stage 2: get the detections out of the log.
+
+    Detections, truth, sensor poses and obstacles, in one metric frame.
+
+    \b
+    Examples:
+      cadence extract results/flight
+      cadence extract results/flight --config mapping.toml --force
+    """
+    from pipeline.extract import ExtractConfig
+    from pipeline.extract import extract as stage
+
+    _show(stage(mission, stage_config(ExtractConfig, "extract", config, settings or (), seed), Progress(quiet), force), as_json)
+
+
+@app.command()
+def infer(
+    mission: Mission, config: Config = None, settings: Set = None, seed: Seed = None, force: Force = False,
+    quiet: Quiet = False, as_json: Json = False,
+) -> None:  # fmt: skip
+    r"""Stage 3: draw weighted hypotheses, past and future.
+
+    \b
+    Example:
+      cadence infer results/flight --set infer.num_hypotheses=50 --seed 7
+    """
+    from pipeline.infer import InferConfig
+    from pipeline.infer import infer as stage
+
+    _show(stage(mission, stage_config(InferConfig, "infer", config, settings or (), seed), Progress(quiet), force), as_json)
+
+
+@app.command()
+def export(
+    mission: Mission, config: Config = None, settings: Set = None, force: Force = False, quiet: Quiet = False,
+    as_json: Json = False,
+) -> None:  # fmt: skip
+    r"""Stage 4: write the files for Foxglove.
+
+    The side file NAME.cadence.mcap, to be opened together with the log, and a layout to import.
+
+    \b
+    Example:
+      cadence export results/flight
+    """
+    from pipeline.export import ExportConfig
+    from pipeline.export import export as stage
+
+    _show(stage(mission, stage_config(ExportConfig, "export", config, settings or ()), Progress(quiet), force), as_json)
+
+
+@app.command()
+def report(
+    mission: Mission, config: Config = None, settings: Set = None, force: Force = False, quiet: Quiet = False,
+    as_json: Json = False,
+) -> None:  # fmt: skip
+    r"""Stage 5: write report.html, a page for any browser.
+
+    \b
+    Example:
+      cadence report results/flight
+    """
+    from pipeline.report import ReportConfig
+    from pipeline.report import report as stage
+
+    _show(stage(mission, stage_config(ReportConfig, "report", config, settings or ()), Progress(quiet), force), as_json)
+
+
+@app.command()
+def evaluate(
+    mission: Mission, config: Config = None, settings: Set = None, seed: Seed = None, force: Force = False,
+    quiet: Quiet = False, as_json: Json = False,
+) -> None:  # fmt: skip
+    r"""Score hypotheses against the truth of the log.
+
+    Beside the rivals: Kalman + RTS, the bank alone, interpolation, hold.
+
+    \b
+    Example:
+      cadence evaluate results/flight
+    """
+    from pipeline.evaluate import EvaluateConfig
+    from pipeline.evaluate import evaluate as stage
+
+    _show(
+        stage(mission, stage_config(EvaluateConfig, "evaluate", config, settings or (), seed), Progress(quiet), force), as_json
+    )
+
+
+@app.command()
+def simulate(
+    out: Out, config: Config = None, settings: Set = None, seed: Seed = None, force: Force = False, quiet: Quiet = False,
+    as_json: Json = False,
+) -> None:  # fmt: skip
+    r"""Write mission logs from a simulated world.
+
+    A moving target, moving sensors, sparse detections, obstacles, and the truth.
+
+    \b
+    Examples:
+      cadence simulate --out logs --seed 7
+      cadence simulate --out logs --set simulate.kind=patrol --set simulate.episodes=20
+    """
+    from pipeline.simulate import SimulateConfig
+    from pipeline.simulate import simulate as stage
+
+    _show(stage(out, stage_config(SimulateConfig, "simulate", config, settings or (), seed), Progress(quiet), force), as_json)
+
+
+@app.command()
+def train(
+    out: Out, config: Config = None, settings: Set = None, seed: Seed = None, quiet: Quiet = False, as_json: Json = False
+) -> None:
+    r"""Train a checkpoint.
+
+    From a folder of logs with truth, or from the simulator. Continues after an interruption.
+
+    \b
+    Examples:
+      cadence train --out runs/general --seed 1
+      cadence train --out runs/ships --config ships.toml
+    """
+    from pipeline.train import TrainConfig
+    from pipeline.train import train as stage
+
+    _show(stage(out, stage_config(TrainConfig, "train", config, settings or (), seed), Progress(quiet)), as_json)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command and return its exit code; foreseen failures are one line on stderr, defects keep their traceback."""
+    try:
+        code = app(args=arguments, prog_name="cadence", standalone_mode=False)
+        sys.stdout.flush()
+    except CadenceError as error:
+        _complain(error)
+        return error.exit_code
+    except typer.TyperException as error:
+        _complain(UsageError(f"{error.format_message()} Try: cadence --help"))
+        return UsageError.exit_code
+    except BrokenPipeError:
+        # The reader (head, less) has what it wanted; what Python would still flush at exit goes nowhere.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    if code == EXIT_INTERRUPTED:
+        typer.echo("cadence: interrupted; finished stages are kept, the same command continues after them", err=True)
+    return code if isinstance(code, int) else 0
+
+
+def _complain(error: CadenceError) -> None:
+    typer.echo(f"cadence: error: {' '.join(str(error).split())}", err=True)
+
+
+def _show(result: StageResult, as_json: bool) -> None:
+    typer.echo(to_json(result) if as_json else stage_summary(result))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,45 @@
+"""Results as text for people and as JSON for programs."""
+
+import dataclasses
+import json
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+from pipeline.manifest import StageResult
+
+if TYPE_CHECKING:
+    from pipeline.run import LogResult
+
+SHOWN_STAGES = ("export", "report")
+"""Whose files a person wants to open; the others are intermediate."""
+
+
+def to_json(value: Any) -> str:
+    """Indented JSON; dataclasses become objects, paths strings."""
+    return json.dumps(value, indent=2, ensure_ascii=False, default=_jsonable)
+
+
+def stage_summary(result: StageResult) -> str:
+    """One line for the stage and one for each of its files."""
+    return "\n".join([f"{result.stage}: {result.status}", *(f"  {path}" for path in result.outputs)])
+
+
+def log_record(result: "LogResult") -> dict[str, Any]:
+    """The result of one log of `cadence run` for `--json`."""
+    error = None if result.error is None else {"message": str(result.error), "exit_code": result.error.exit_code}
+    return {"log": str(result.log), "directory": str(result.directory), "stages": result.stages, "error": error}
+
+
+def log_summary(results: Sequence["LogResult"]) -> str:
+    """One line for each log, and below it the files to look at."""
+    lines = []
+    for result in results:
+        lines.append(f"{result.log}: {'ok' if result.error is None else 'failed'}")
+        lines += [f"  {path}" for stage in result.stages if stage.stage in SHOWN_STAGES for path in stage.outputs]
+    return "\n".join(lines)
+
+
+def _jsonable(value: Any) -> Any:
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
+    return dict(value) if isinstance(value, Mapping) else str(value)

@@ -1,0 +1,24 @@
+"""What all tests share: one thread (results depend on the number of threads), repeatable property tests, optional data."""
+
+import os
+from pathlib import Path
+
+import pytest
+from hypothesis import settings
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+os.environ.setdefault("MPLBACKEND", "Agg")
+
+# Busy machines are slow at times: no deadline for one example (pytest limits the test), and the same examples each time.
+settings.register_profile("cadence", deadline=None, derandomize=True, max_examples=50)
+settings.load_profile("cadence")
+
+SHARED_DATA = Path(__file__).resolve().parents[1].parent / "shared" / "data"
+
+
+@pytest.fixture(scope="session")
+def shared_data() -> Path:
+    """Folder of recorded logs beside the checkout; tests that ask for it are skipped where it is absent."""
+    if not SHARED_DATA.is_dir():
+        pytest.skip("needs the recorded logs in ../shared/data")
+    return SHARED_DATA

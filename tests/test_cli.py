@@ -1,0 +1,167 @@
+"""The command line: help, exit codes, what goes to which stream; and that it starts fast."""
+
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import cli
+from cadence.errors import InputError
+from pipeline.manifest import StageResult
+from pipeline.progress import Progress
+
+ROOT = Path(__file__).resolve().parents[1]
+COMMANDS = ("info", "run", "ingest", "extract", "infer", "export", "report", "evaluate", "simulate", "train")
+
+
+def test_help_names_every_command(capsys):
+    assert cli.main(["--help"]) == 0
+    text = capsys.readouterr().out
+    assert re.findall(r"^  ([a-z]+) ", text.split("Commands:")[1], flags=re.MULTILINE) == list(COMMANDS)
+    assert "..." not in text.split("Commands:")[1]
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_of_each_command_is_complete(command, capsys):
+    assert cli.main([command, "--help"]) == 0
+    text = capsys.readouterr().out
+    assert f"Usage: cadence {command}" in text
+    assert re.search(rf"Examples?:\n +cadence {command} ", text)
+    options = re.findall(r"^ +(?:-q, )?(--[a-z-]+)", text, flags=re.MULTILINE)
+    for option in re.findall(r"--[a-z][a-z-]+", text.split("Options:")[0]):
+        assert option in options, f"an example uses {option}, which {command} does not have"
+
+
+@pytest.mark.parametrize("command", [command for command in COMMANDS if command != "info"])
+def test_common_options_are_everywhere(command, capsys):
+    cli.main([command, "--help"])
+    text = capsys.readouterr().out
+    assert all(f"{option} " in text for option in ("--config", "--set", "--quiet", "--json"))
+    assert ("--force " in text) == (command != "train")  # train continues what is there
+
+
+def test_version(capsys):
+    assert cli.main(["--version"]) == 0
+    assert re.match(r"cadence \S+, torch \S+, ", capsys.readouterr().out)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["rnu"], "No such command 'rnu'"),
+        (["run"], "Missing argument 'LOG...'"),
+        (["run", "x.mcap"], "Missing option '--out'"),
+        (["run", "x.mcap", "--out", "o", "--nope"], "No such option: --nope"),
+        (["run", "x.mcap", "--out", "o", "--seed", "x"], "'x' is not a valid int"),
+    ],
+)
+def test_wrong_call_is_one_line_and_exit_code_2(arguments, says, capsys):
+    assert cli.main(arguments) == 2
+    captured = capsys.readouterr()
+    assert captured.out == "" and captured.err.count("\n") == 1
+    assert captured.err.startswith("cadence: error: ") and says in captured.err
+
+
+@pytest.fixture
+def fake_infer(monkeypatch):
+    """`cadence infer` with a stage that does what `behaviour` says; returns the list of its calls."""
+    import pipeline.infer
+
+    calls = []
+
+    def install(behaviour=lambda: StageResult("infer", "done", (Path("m/hypotheses.parquet"),), {"num_windows": 3})):
+        def stage(directory, config, progress, force=False):
+            calls.append((directory, config, progress, force))
+            return behaviour()
+
+        monkeypatch.setattr(pipeline.infer, "infer", stage)
+        return calls
+
+    return install
+
+
+def raiser(error):
+    def behaviour():
+        raise error
+
+    return behaviour
+
+
+def test_flags_reach_the_stage(fake_infer, tmp_path):
+    calls = fake_infer()
+    (tmp_path / "c.toml").write_text("[infer]\nnum_hypotheses = 5\nseed = 1\n[export]\n")
+    arguments = [
+        "infer",
+        "m",
+        "--config",
+        str(tmp_path / "c.toml"),
+        "--set",
+        "infer.num_hypotheses=7",
+        "--seed",
+        "9",
+        "--force",
+        "-q",
+    ]
+    assert cli.main(arguments) == 0
+    ((directory, config, progress, force),) = calls
+    assert (directory, progress, force) == (Path("m"), Progress(quiet=True), True)
+    assert (config.num_hypotheses, config.seed) == (7, 9)
+
+
+def test_results_are_on_stdout_for_people_or_as_json(fake_infer, capsys):
+    fake_infer()
+    assert cli.main(["infer", "m"]) == 0
+    assert capsys.readouterr().out == "infer: done\n  m/hypotheses.parquet\n"
+    assert cli.main(["infer", "m", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out) == {
+        "stage": "infer", "status": "done", "outputs": ["m/hypotheses.parquet"], "summary": {"num_windows": 3},
+    }  # fmt: skip
+
+
+def test_foreseen_failure_is_one_line_with_its_code(fake_infer, capsys):
+    fake_infer(raiser(InputError("m: nothing\n  here; look elsewhere")))
+    assert cli.main(["infer", "m"]) == 3
+    assert capsys.readouterr() == ("", "cadence: error: m: nothing here; look elsewhere\n")
+
+
+def test_interruption_says_that_finished_stages_are_kept(fake_infer, capsys):
+    fake_infer(raiser(KeyboardInterrupt()))
+    assert cli.main(["infer", "m"]) == 130
+    captured = capsys.readouterr()
+    assert captured.out == "" and captured.err.count("\n") == 1 and "finished stages are kept" in captured.err
+
+
+def test_defect_keeps_its_traceback(fake_infer):
+    fake_infer(raiser(ZeroDivisionError("defect")))
+    with pytest.raises(ZeroDivisionError):
+        cli.main(["infer", "m"])
+
+
+def test_unknown_key_names_the_known_ones(capsys):
+    assert cli.main(["infer", "m", "--set", "infer.nope=1"]) == 4
+    error = capsys.readouterr().err
+    assert "infer: unknown key 'nope'; known keys: " in error and "num_hypotheses" in error and error.count("\n") == 1
+
+
+@pytest.mark.parametrize("command", ["infer", "simulate", "train", "evaluate", "extract"])
+def test_seed_has_a_meaning_wherever_it_is_offered(command):
+    import importlib
+
+    from pipeline.config import with_seed
+
+    config = getattr(importlib.import_module(f"pipeline.{command}"), f"{command.capitalize()}Config")()
+    assert with_seed(config, 123_456) != config
+
+
+def test_help_is_fast_because_heavy_imports_wait():
+    code = "import sys, cli; cli.main(['run', '--help']); heavy = {'torch', 'pyarrow', 'scipy', 'matplotlib', 'mcap'}; sys.exit(bool(heavy & set(sys.modules)))"
+    assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, check=False).returncode == 0
+
+
+def test_closed_pipe_is_quiet():
+    command = f"'{sys.executable}' cli.py --help | true; exit ${{PIPESTATUS[0]}}"
+    finished = subprocess.run(["bash", "-c", command], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert finished.stderr == "" and finished.returncode in (0, 1)
