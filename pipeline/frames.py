@@ -56,6 +56,6 @@ def to_geodetic(frame: Frame, x_m: FloatArray, y_m: FloatArray) -> tuple[FloatAr
 
 def _transformer(frame: Frame) -> Transformer:
     if not frame.is_georeferenced:
-        raise InputError(f"the mission frame {frame.frame_id!r} has no datum to get latitude and longitude from; set extract.datum")
+        raise InputError(f"the mission frame {frame.frame_id!r} has no datum; set extract.datum")
     local = f"+proj=aeqd +lat_0={frame.latitude_deg!r} +lon_0={frame.longitude_deg!r} +datum=WGS84 +units=m +no_defs"
     return Transformer.from_crs("EPSG:4326", local, always_xy=True)

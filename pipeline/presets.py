@@ -61,9 +61,7 @@ PRESETS: dict[str, Preset] = {
     ),
     "PoseArray": _metric("geometry_msgs.PoseArray", "poses[:].position"),
     # Some JSON recorders leave out Odometry's PoseWithCovariance.
-    "Odometry": replace(
-        _metric("nav_msgs.Odometry", "pose.pose.position", "pose.position"), covariance=("pose.covariance",)
-    ),
+    "Odometry": replace(_metric("nav_msgs.Odometry", "pose.pose.position", "pose.position"), covariance=("pose.covariance",)),
     "NavSatFix": replace(_geodetic("sensor_msgs.NavSatFix"), status=("status.status",)),
     "GeoPointStamped": replace(_geodetic("geographic_msgs.GeoPointStamped", "position."), time=TIME_PATHS),
     "LocationFix": _geodetic("foxglove.LocationFix"),

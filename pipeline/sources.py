@@ -13,7 +13,10 @@ PLACEHOLDERS = ("agent", "sensor")
 LOG_TIME = "log_time"
 PUBLISH_TIME = "publish_time"
 
-_PATH_KEYS = (
+PATH_KEYS = {"agent": "agent_path", "sensor": "sensor_path"}
+"""The keys of a source that state a message path under another name than the preset's field; all others are named alike."""
+
+_CHECKED = (
     "agent_path", "sensor_path", "x", "y", "z", "latitude", "longitude", "altitude", "covariance", "score", "time", "frame_id",
 )  # fmt: skip
 
@@ -40,7 +43,7 @@ class SourceConfig:
     agent, agent_path    who was seen: a constant, or a message path; neither (nor `{agent}`) means origin unknown
     sensor, sensor_path  who saw it
     x, y, z     message paths in metres; or latitude, longitude (degrees) and altitude (metres)
-    covariance  message path of 4, 9 or 36 numbers, row-major, x (east) and y (north) first, m²
+    covariance  message path of 1, 4, 9 or 36 numbers (a variance, or rows of a matrix), x (east) and y (north) first, m²
     sigma_m     standard deviation of x and y where the message states no covariance
     score       message path of a confidence
     time        message path of a stamp, or "log_time" or "publish_time"; default: the header's stamp, else the log time
@@ -68,7 +71,7 @@ class SourceConfig:
     def __post_init__(self) -> None:
         if self.preset is not None and self.preset not in PRESETS:
             raise ValueError(f"preset {self.preset!r} is not known; known: {', '.join(PRESETS)}")
-        for name in _PATH_KEYS:
+        for name in _CHECKED:
             text = getattr(self, name)
             if text is not None and text not in (LOG_TIME, PUBLISH_TIME):
                 _check_path(name, text)
@@ -115,7 +118,7 @@ def resolve_paths(source: SourceConfig, schema_name: str) -> Preset:
         base = Preset((), time=base.time, frame_id=base.frame_id, agent=base.agent, sensor=base.sensor, score=base.score)
     paths = {item.name: getattr(base, item.name) for item in fields(Preset)}
     for name_of_path in paths:
-        stated = getattr(source, {"agent": "agent_path", "sensor": "sensor_path"}.get(name_of_path, name_of_path), None)
+        stated = getattr(source, PATH_KEYS.get(name_of_path, name_of_path), None)
         if stated is not None:
             paths[name_of_path] = (stated,)
     return Preset(**paths)

@@ -74,12 +74,11 @@ def _edges(duration_s: float, config: ThinningConfig, generator: np.random.Gener
         num_cycles = int((duration_s - reached_s) / cycle_s * 1.2) + 8
         means = np.tile([config.mean_gap_s, config.mean_burst_s], num_cycles)
         lengths = generator.exponential(means)
+        if starts_in_burst and not pieces:
+            lengths[0] = 0.0
         pieces.append(lengths)
         reached_s += float(lengths.sum())
-    lengths = np.concatenate(pieces)
-    if starts_in_burst:
-        lengths[0] = 0.0
-    return np.cumsum(lengths)
+    return np.cumsum(np.concatenate(pieces))
 
 
 def _apart(time_s: FloatArray, seen: BoolArray, min_interval_s: float) -> BoolArray:
