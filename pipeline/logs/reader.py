@@ -16,7 +16,16 @@ from typing import BinaryIO
 from mcap.opcode import Opcode
 
 from cadence.errors import InputError
-from pipeline.logs.records import MAGIC, MESSAGE_HEAD, DamagedRecord, parse_chunk, parse_metadata, unpack_chunk, walk
+from pipeline.logs.records import (
+    MAGIC,
+    MESSAGE_HEAD,
+    DamagedRecord,
+    parse_chunk,
+    parse_metadata,
+    unpack_chunk,
+    unpack_cut_chunk,
+    walk,
+)
 from pipeline.logs.salvage import Block, Loss, Plan, scan_log
 
 _MAX_SENTENCES = 20
@@ -268,23 +277,23 @@ def _merge(
             on_bytes(block.length)
 
 
-def _rows(
-    file: BinaryIO, block: Block, wanted: Mapping[int, Channel]
-) -> Iterator[tuple[int, int, int, RawMessage]]:
+def _rows(file: BinaryIO, block: Block, wanted: Mapping[int, Channel]) -> Iterator[tuple[int, int, int, RawMessage]]:
     """(log time, offset of the block, offset inside it, message) of the wanted messages, sorted."""
     data = _read(file, block.offset, block.length)
-    if block.is_chunk:
+    if block.kind == "chunk":
         data = unpack_chunk(parse_chunk(data))
-    rows = _slices(data, block.offset, wanted)
+    elif block.kind == "cut":
+        data = unpack_cut_chunk(data)[1]
+    rows = _slices(data, block, wanted)
     return rows if block.is_sorted else iter(sorted(rows, key=lambda row: row[:3]))
 
 
-def _slices(data: bytes, block_offset: int, wanted: Mapping[int, Channel]) -> Iterator[tuple[int, int, int, RawMessage]]:
+def _slices(data: bytes, block: Block, wanted: Mapping[int, Channel]) -> Iterator[tuple[int, int, int, RawMessage]]:
     unpack, size = MESSAGE_HEAD.unpack_from, MESSAGE_HEAD.size
-    for opcode, begin, end in walk(data):
+    for opcode, begin, end in walk(data, is_cut=block.kind == "cut"):
         if opcode != Opcode.MESSAGE:
             continue
         channel_id, sequence, log_time, publish_time = unpack(data, begin)
         channel = wanted.get(channel_id)
         if channel is not None:
-            yield log_time, block_offset, begin, RawMessage(channel, log_time, publish_time, sequence, data[begin + size : end])
+            yield log_time, block.offset, begin, RawMessage(channel, log_time, publish_time, sequence, data[begin + size : end])

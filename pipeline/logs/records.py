@@ -115,6 +115,29 @@ def unpack_chunk(chunk: records.Chunk) -> bytes:
     return data
 
 
+def unpack_cut_chunk(body: bytes) -> tuple[records.Chunk, bytes]:
+    """The chunk whose body is cut off by the end of the file, and what can be unpacked of it; no checksum covers that."""
+    with damage():
+        start, end, size, crc, name_length = CHUNK_HEAD.unpack_from(body)
+        compression = body[CHUNK_HEAD.size : CHUNK_HEAD.size + name_length].decode()
+        data = body[CHUNK_HEAD.size + name_length + 8 :]
+        if compression == "zstd":
+            data = zstandard.ZstdDecompressor().stream_reader(BytesIO(data)).read(MAX_CHUNK_BYTES)
+        elif compression == "lz4":
+            data = lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=MAX_CHUNK_BYTES)
+        elif compression:
+            raise DamagedRecord(f"it uses the compression {compression!r}, which is not known")
+    return records.Chunk(compression, b"", end, start, crc, size), data
+
+
+def is_cut_chunk(head: bytes, length: int) -> bool:
+    """Whether `head`, the first bytes of a chunk's body, agrees that the body should be `length` bytes long."""
+    if len(head) < CHUNK_HEAD.size:
+        return False
+    inner = CHUNK_HEAD.size + int(CHUNK_HEAD.unpack_from(head)[-1])
+    return len(head) >= inner + 8 and int.from_bytes(head[inner : inner + 8], "little") == length - inner - 8
+
+
 def _decompress(chunk: records.Chunk) -> bytes:
     if chunk.compression == "":
         return chunk.data
@@ -132,16 +155,19 @@ def _decompress(chunk: records.Chunk) -> bytes:
     raise DamagedRecord(f"it uses the compression {chunk.compression!r}, which is not known")
 
 
-def walk(data: bytes) -> Iterator[tuple[int, int, int]]:
-    """Opcode, begin and end of the body of every record in `data`; `DamagedRecord` where the next one cannot be."""
+def walk(data: bytes, is_cut: bool = False) -> Iterator[tuple[int, int, int]]:
+    """Opcode, begin and end of the body of every record in `data`.
+
+    Raises `DamagedRecord` where the next one cannot be a record, or stops there if the data are known to be cut off.
+    """
     position, size = 0, len(data)
     while position < size:
-        if position + 9 > size:
-            raise DamagedRecord("its last record is cut off")
-        opcode, length = HEAD.unpack_from(data, position)
-        begin = position + 9
+        opcode, length = HEAD.unpack_from(data, position) if position + HEAD.size <= size else (0, 0)
+        begin = position + HEAD.size
         position = begin + length
         # Opcode 0 does not exist; without this test megabytes of zeros would be walked nine bytes at a time.
         if opcode == 0 or position > size or (opcode == Opcode.MESSAGE and length < MESSAGE_HEAD.size):
+            if is_cut:
+                return
             raise DamagedRecord("the lengths of the records inside contradict each other")
         yield opcode, begin, position

@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import BinaryIO, Final, TypeVar
+from typing import BinaryIO, Final, Literal, TypeVar
 
 from mcap import records
 from mcap.opcode import Opcode
@@ -26,11 +26,13 @@ from pipeline.logs.records import (
     StrictStream,
     damage,
     index_count,
+    is_cut_chunk,
     parse_channel,
     parse_chunk,
     parse_metadata,
     parse_schema,
     unpack_chunk,
+    unpack_cut_chunk,
     walk,
 )
 from pipeline.logs.summary import Summary, parse_summary_record, read_summary
@@ -39,6 +41,7 @@ LOOSE_BLOCK_BYTES: Final = 2**20
 """Messages outside chunks are planned in stretches of about this size."""
 _SEARCH_BYTES: Final = 2**20
 _MAX_SEARCH_BYTES: Final = 2**28
+_CHUNK_HEAD_BYTES: Final = 64
 _BELIEVED: Final = 3  # points that make a place believable after damage, see _Scanner._points
 _CANDIDATE: Final = re.compile(rb"[\x01-\x0f](?=[\x00-\xff]{5}\x00{3})")  # an opcode and a length below 2**40
 _Definition = TypeVar("_Definition", records.Channel, records.Schema)
@@ -57,12 +60,13 @@ class Block:
     """A stretch of the file which holds messages: the body of a chunk record, or records outside chunks.
 
     offset, length  bytes in the file; for loose records they begin with a record head, for chunks with the chunk's fields
+    kind            a "cut" chunk is the last thing in a file that ends inside it
     num_messages    by channel id
     """
 
     offset: int
     length: int
-    is_chunk: bool
+    kind: Literal["chunk", "cut", "loose"]
     start_ns: int
     end_ns: int
     is_sorted: bool
@@ -158,6 +162,9 @@ class _Scanner:
         head = self._read(offset, HEAD.size)
         opcode, length = HEAD.unpack(head)
         end = offset + HEAD.size + length
+        if opcode == Opcode.CHUNK and end > self.limit == self.size:
+            self._take_cut_chunk(offset + HEAD.size, length)
+            return
         if opcode == 0 or end > self.limit:
             raise DamagedRecord("the file ends inside a record" if opcode else "there is no such record")
         if opcode != Opcode.MESSAGE_INDEX:
@@ -240,12 +247,28 @@ class _Scanner:
             if block.num_messages:
                 self.plan.blocks.append(block)
 
-    def _block_of_chunk(self, offset: int, length: int, data: bytes) -> Block:
+    def _take_cut_chunk(self, offset: int, length: int) -> None:
+        """Save the beginning of the chunk in which the file ends."""
+        body = self._read(offset, self.size - offset)
+        if not is_cut_chunk(body[:_CHUNK_HEAD_BYTES], length):
+            raise DamagedRecord("a chunk is longer than the file")
+        chunk, data = unpack_cut_chunk(body)
+        block = self._block_of_chunk(offset, len(body), data, is_cut=True)
+        start, end = max(block.end_ns, chunk.message_start_time), chunk.message_end_time
+        saved = sum(block.num_messages.values())
+        if saved:
+            self._flush_loose()
+            self.plan.blocks.append(block)
+        reason = f"the file ends inside this chunk; the {saved} messages at its beginning were saved"
+        self.plan.losses.append(Loss(offset - HEAD.size, reason, (start, end) if _is_span(start, end) else None))
+        self.position = self.size
+
+    def _block_of_chunk(self, offset: int, length: int, data: bytes, is_cut: bool = False) -> Block:
         counts: Counter[int] = Counter()
         first, last, previous, is_sorted = 2**64, -1, -1, True
         definitions = []
         unpack = MESSAGE_HEAD.unpack_from
-        for opcode, begin, end in walk(data):
+        for opcode, begin, end in walk(data, is_cut):
             if opcode == Opcode.MESSAGE:
                 channel_id, _, log_time, _ = unpack(data, begin)
                 counts[channel_id] += 1
@@ -256,7 +279,7 @@ class _Scanner:
                 definitions.append((opcode, data[begin:end]))
         for opcode, body in definitions:  # only now: a chunk whose end is broken must not leave half of itself behind
             self._define(opcode, body)
-        return Block(offset, length, True, first, last, is_sorted, dict(counts))
+        return Block(offset, length, "cut" if is_cut else "chunk", first, last, is_sorted, dict(counts))
 
     def _define(self, opcode: int, body: bytes) -> None:
         """Take a channel or schema; a second definition that differs is reported, the first stays."""
@@ -283,7 +306,7 @@ class _Scanner:
         if expected not in (0, self.crc) and not self.plan.losses:
             place = "outside the chunks" if self.plan.has_checksums else "somewhere"
             self.plan.doubts.append(f"The checksum over all data does not match: something was changed {place}.")
-        has_loose = any(not block.is_chunk for block in self.plan.blocks)
+        has_loose = any(block.kind == "loose" for block in self.plan.blocks)
         self.plan.has_checksums = expected != 0 or (self.plan.has_checksums and not has_loose)
         self.plan.reached_end = True
 
@@ -301,7 +324,7 @@ class _Scanner:
         index = self.plan.summary.chunks.get(offset) if self.plan.summary else None
         if index is not None:
             return index.message_start_time, index.message_end_time
-        return (start, end) if 0 < start <= end < 2**63 else None
+        return (start, end) if _is_span(start, end) else None
 
     def _resume(self, reason: str) -> None:
         """After damage at the position: note the loss, go on at the next place that can be believed."""
@@ -375,7 +398,7 @@ class _Scanner:
         if len(data) < HEAD.size + CHUNK_HEAD.size or data[0] != Opcode.CHUNK:
             return None
         start, end, *_ = CHUNK_HEAD.unpack_from(data, HEAD.size)
-        return (start, end) if 0 < start <= end < 2**63 else None
+        return (start, end) if _is_span(start, end) else None
 
     def _cross_check(self) -> None:
         """Compare with what the summary says."""
@@ -389,7 +412,9 @@ class _Scanner:
             return
         plan.doubts += _prefer_index("Channel", plan.channels, summary.channels)
         plan.doubts += _prefer_index("Schema", plan.schemas, summary.schemas)
-        seen = {loss.offset for loss in plan.losses} | {block.offset - HEAD.size for block in plan.blocks if block.is_chunk}
+        seen = {loss.offset for loss in plan.losses} | {
+            block.offset - HEAD.size for block in plan.blocks if block.kind == "chunk"
+        }
         for offset, index in summary.chunks.items():
             if offset not in seen and index.message_index_offsets:
                 span = (index.message_start_time, index.message_end_time)
@@ -404,6 +429,11 @@ def _prefer_index(kind: str, known: dict[int, _Definition], indexed: Mapping[int
             doubts.append(f"{kind} {number} differs between the data and the index; the index was used.")
             known[number] = record
     return doubts
+
+
+def _is_span(start: int, end: int) -> bool:
+    """Whether times from the header of a chunk, which no checksum covers, can be a span."""
+    return 0 < start <= end < 2**63
 
 
 def _library(body: bytes) -> str:
@@ -438,4 +468,4 @@ class _LooseRun:
 
     def block(self) -> Block:
         """The block of the records so far."""
-        return Block(self.begin, self.end - self.begin, False, self.first, self.last, self.is_sorted, dict(self.counts))
+        return Block(self.begin, self.end - self.begin, "loose", self.first, self.last, self.is_sorted, dict(self.counts))
