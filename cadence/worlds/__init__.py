@@ -1,0 +1,1 @@
+"""Worlds that make missions: terrain, ways, sensors, and who moves among them."""

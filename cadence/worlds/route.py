@@ -85,8 +85,8 @@ class RouteField:
     def to(cls, grid: RouteGrid, graph: sparse.csr_matrix, goal_m: Array) -> "RouteField":
         """The field of `graph` (see `RouteGrid.graph`) towards the free cell nearest to `goal_m`."""
         goal = grid.cell_of(goal_m)
-        _, previous = csgraph.dijkstra(graph, directed=False, indices=goal, return_predecessors=True)
-        return cls(grid, grid.centres_m.reshape(-1, 2)[goal], goal, previous)
+        _, previous = csgraph.dijkstra(graph, directed=False, indices=[goal], return_predecessors=True)
+        return cls(grid, grid.centres_m.reshape(-1, 2)[goal], goal, previous[0])
 
     def path_from(self, position_m: Array) -> Array:
         """Cell centres [P, 2] from the cell of a point to the goal; the point itself is not part of it."""

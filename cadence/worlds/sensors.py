@@ -130,4 +130,5 @@ def _lanes(rng: np.random.Generator, side_m: float, lane_m: float) -> Array:
     ends = np.stack([np.tile([-reach, reach, reach, -reach], len(offset))[: 2 * len(offset)], np.repeat(offset, 2)], axis=1)
     turn = 0.5 * np.pi * rng.integers(4) + rng.uniform(-0.25, 0.25)
     rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
-    return np.clip(ends @ rotation.T, -side_m / 2, side_m / 2)
+    lanes: Array = np.clip(ends @ rotation.T, -side_m / 2, side_m / 2)
+    return lanes

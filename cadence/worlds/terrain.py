@@ -64,7 +64,8 @@ def smooth_polygon(
     shape = radius[:, None] * np.stack([np.cos(bearing), np.sin(bearing)], axis=1) * [1.0, rng.uniform(0.4, 1.0)]
     turn = rng.uniform(0.0, 2 * np.pi)
     shape = shape @ np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
-    return centre_m + shape * (radius_m / np.hypot(*shape.T).max())
+    polygon: Array = centre_m + shape * (radius_m / np.hypot(*shape.T).max())
+    return polygon
 
 
 def random_archipelago(
@@ -123,7 +124,7 @@ class Clearance:
 
     @classmethod
     def of(cls, terrain: Terrain, cell_m: float) -> "Clearance":
-        """The raster of `terrain` with cells of about `cell_m`; a cell is land where its centre lies within half a diagonal of an obstacle."""
+        """The raster of `terrain` with cells of about `cell_m`; land reaches half a diagonal beyond every obstacle."""
         size = round(terrain.side_m / cell_m)
         cell_m = terrain.side_m / size
         axis = (np.arange(size) + 0.5) * cell_m - terrain.side_m / 2
@@ -136,8 +137,9 @@ class Clearance:
             rows = slice(*np.searchsorted(axis, [y0, y1]))
             x, y = np.meshgrid(axis[columns], axis[rows])
             is_land[rows, columns] |= shapely.contains_xy(shape, x, y)
-        distance = ndimage.distance_transform_edt(~is_land) * cell_m if is_land.any() else np.full(is_land.shape, terrain.side_m)
-        return cls(terrain.side_m, cell_m, distance)
+        if not is_land.any():
+            return cls(terrain.side_m, cell_m, np.full(is_land.shape, terrain.side_m))
+        return cls(terrain.side_m, cell_m, ndimage.distance_transform_edt(~is_land) * cell_m)
 
     @property
     def error_m(self) -> float:
