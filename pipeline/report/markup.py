@@ -1,0 +1,98 @@
+"""The few pieces of HTML that the sections are made of. Every text goes through `escape`: logs choose their own names."""
+
+import json
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from html import escape
+from typing import Any
+
+MAX_VALUE_CHARACTERS = 400
+
+
+def text(value: object) -> str:
+    """A value from JSON or a log as escaped text for people; long ones are cut and say so."""
+    if value is None:
+        shown = "none"
+    elif isinstance(value, bool):
+        shown = "yes" if value else "no"
+    elif isinstance(value, float):
+        shown = f"{value:.6g}" if math.isfinite(value) else "not a number"
+    elif isinstance(value, str):
+        shown = value
+    else:
+        shown = str(value) if isinstance(value, int) else json.dumps(value, ensure_ascii=False, sort_keys=True)
+    if len(shown) > MAX_VALUE_CHARACTERS:
+        shown = f"{shown[:MAX_VALUE_CHARACTERS]}… ({len(shown):,} characters)"
+    # Lone surrogates, as broken JSON may hold, cannot be written as UTF-8.
+    return escape(shown.encode("utf-8", "replace").decode("utf-8"))
+
+
+def label(key: object) -> str:
+    """A JSON key as escaped words."""
+    return text(str(key).replace("_", " "))
+
+
+def section(title: str, content: str, lead: str = "", kind: str = "", identity: str = "") -> str:
+    """A card; `lead` is text, `content` is HTML."""
+    opening = f'<section{f" id={identity}" if identity else ""}{f" class={json.dumps(kind)}" if kind else ""}><h2>{text(title)}</h2>'
+    return opening + (f"<p>{escape(lead)}</p>" if lead else "") + content + "</section>\n"
+
+
+def table(heads: Sequence[str], rows: Iterable[Sequence[str]], numeric: Sequence[int] = ()) -> str:
+    """A table from cells that are HTML already; `numeric` columns are set to the right."""
+    kinds = [' class="number"' if column in numeric else "" for column in range(len(heads))]
+    head = "".join(f"<th{kind}>{text(name)}</th>" for kind, name in zip(kinds, heads, strict=True))
+    body = "".join("<tr>" + "".join(f"<td{kind}>{cell}</td>" for kind, cell in zip(kinds, row, strict=True)) + "</tr>\n" for row in rows)
+    return f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
+
+
+def pairs(rows: Iterable[tuple[str, str]]) -> str:
+    """A two-column table of names and values, both HTML already."""
+    body = "".join(f'<tr><th scope="row">{name}</th><td>{value}</td></tr>\n' for name, value in rows)
+    return f'<div class="scroll"><table class="pairs"><tbody>{body}</tbody></table></div>'
+
+
+def flatten(value: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
+    """Nested objects as dotted keys in their order; empty ones are left out."""
+    rows: list[tuple[str, Any]] = []
+    for key, item in value.items():
+        if isinstance(item, Mapping):
+            rows += flatten(item, f"{prefix}{key}.")
+        elif item not in ([], ""):
+            rows.append((f"{prefix}{key}", item))
+    return rows
+
+
+def as_toml(tables: Mapping[str, Any]) -> str:
+    """Configuration tables as TOML that `pipeline.config` reads back to the same values; unset keys are left out."""
+    lines = []
+    for name, values in tables.items():
+        lines += [f"[{_toml_key(name)}]", *(f"{_toml_key(key)} = {_toml(item)}" for key, item in values.items() if item is not None), ""]
+    return "\n".join(lines)
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, Mapping):
+        return "{" + ", ".join(f"{_toml_key(key)} = {_toml(item)}" for key, item in value.items() if item is not None) + "}"
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(_toml(item) for item in value) + "]"
+    if isinstance(value, int | float):
+        # JSON has no word for infinity and reads Python's back as a float: TOML calls it inf, and not-a-number nan.
+        return repr(value)
+    return _toml_string(str(value))
+
+
+def _toml_key(key: str) -> str:
+    return key if key.replace("_", "").replace("-", "").isalnum() and key.isascii() else _toml_string(key)
+
+
+def _toml_string(value: str) -> str:
+    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+
+
+def inline_json(value: object) -> str:
+    """JSON that may stand inside a script element: no text of a log can end the element or start another."""
+    dense = json.dumps(value, separators=(",", ":"), ensure_ascii=True, allow_nan=False)
+    return dense.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
