@@ -125,7 +125,10 @@ class HypothesisSet:
 class Estimator(Protocol):
     """What the diffusion model and every rival implement: the same call, joint samples out."""
 
-    name: str
+    @property
+    def name(self) -> str:
+        """What tables call it."""
+        ...
 
     def fit(self, tracks: Detections) -> Self:
         """The estimator adapted to one log by the likelihood of its detections (empirical Bayes); no truth involved.
