@@ -4,11 +4,11 @@ PYTHON ?= $(shell for p in python3 python3.14 python3.13 python3.12 python3.11; 
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
-SOURCES := cli.py cadence pipeline schemas tests benchmarks
+SOURCES := cli.py cadence pipeline schemas tests benchmarks docs/generate.py
 DEMO := out/demo
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test check fix bench clean
+.PHONY: help setup demo test check fix docs bench clean
 
 help:  ## Show this list.
 	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 10
@@ -23,7 +23,7 @@ $(STAMP): pyproject.toml constraints.txt
 	@touch $@
 
 demo: $(STAMP)  ## Simulate a mission, run the whole pipeline on it, say where to look.
-	$(BIN)/cadence simulate --out $(DEMO)/logs --set simulate.kind=patrol --set simulate.episodes=1 --seed 7 --force
+	$(BIN)/cadence simulate --out $(DEMO)/logs --seed 7
 	$(BIN)/cadence run $(DEMO)/logs/*.mcap --out $(DEMO)/results
 	@echo
 	@echo "Look at:"
@@ -47,6 +47,9 @@ check: $(STAMP)  ## Lint, format check, types, fast tests.
 fix: $(STAMP)  ## Let ruff mend what it can, and format.
 	$(BIN)/ruff check --fix $(SOURCES)
 	$(BIN)/ruff format $(SOURCES)
+
+docs: $(STAMP)  ## Write docs/cli.md and docs/configuration.md from the code.
+	$(BIN)/python docs/generate.py
 
 bench: $(STAMP)  ## Run every benchmark script; each prints its own table.
 	@for script in benchmarks/*.py; do echo "== $$script"; $(BIN)/python $$script || exit 1; done

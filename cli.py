@@ -37,7 +37,7 @@ app = typer.Typer(
 )
 
 Log = Annotated[Path, typer.Argument(metavar="LOG", help="Mission log (MCAP).", show_default=False)]
-Logs = Annotated[list[Path], typer.Argument(metavar="LOG...", help="Mission logs (MCAP).", show_default=False)]
+Logs = Annotated[list[Path], typer.Argument(metavar="LOG", help="Mission logs (MCAP).", show_default=False)]
 Mission = Annotated[
     Path, typer.Argument(metavar="MISSION", help="Mission directory, as written by ingest or run.", show_default=False)
 ]
@@ -67,7 +67,7 @@ def _root(version: Annotated[bool, typer.Option("--version", help="Print version
 
 @app.command()
 def info(log: Log, as_json: Json = False) -> None:
-    r"""Show what is in a log, and the settings that fit it.
+    """Show what is in a log, and the settings that fit it.
 
     Channels, schemas, rates, time range, health; which channels look like detections, truth, frames or obstacles.
 
@@ -87,7 +87,7 @@ def run(
     logs: Logs, out: Out, config: Config = None, settings: Set = None, seed: Seed = None, force: Force = False,
     quiet: Quiet = False, as_json: Json = False,
 ) -> int:  # fmt: skip
-    r"""Run all stages on every log.
+    """Run all stages on every log.
 
     Ingest, extract, infer, export, report; finished stages are skipped. Each log gets the mission directory
     DIR/<name of the log>. One bad log does not stop the others.
@@ -115,7 +115,7 @@ def ingest(
     log: Log, out: Out, config: Config = None, settings: Set = None, force: Force = False, quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:  # fmt: skip
-    r"""Stage 1: catalogue a log.
+    """Stage 1: catalogue a log.
 
     Channels, rates, health and a suggested mapping go into the mission directory DIR/<name of the log>.
 
@@ -135,7 +135,7 @@ def extract(
     mission: Mission, config: Config = None, settings: Set = None, seed: Seed = None, force: Force = False,
     quiet: Quiet = False, as_json: Json = False,
 ) -> None:  # fmt: skip
-    r"""Stage 2: get the detections out of the log.
+    """Stage 2: get the detections out of the log.
 
     Detections, truth, sensor poses and obstacles, in one metric frame.
 
@@ -155,7 +155,7 @@ def infer(
     mission: Mission, config: Config = None, settings: Set = None, seed: Seed = None, force: Force = False,
     quiet: Quiet = False, as_json: Json = False,
 ) -> None:  # fmt: skip
-    r"""Stage 3: draw weighted hypotheses, past and future.
+    """Stage 3: draw weighted hypotheses, past and future.
 
     \b
     Example:
@@ -172,7 +172,7 @@ def export(
     mission: Mission, config: Config = None, settings: Set = None, force: Force = False, quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:  # fmt: skip
-    r"""Stage 4: write the files for Foxglove.
+    """Stage 4: write the files for Foxglove.
 
     The side file NAME.cadence.mcap, to be opened together with the log, and a layout to import.
 
@@ -191,7 +191,7 @@ def report(
     mission: Mission, config: Config = None, settings: Set = None, force: Force = False, quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:  # fmt: skip
-    r"""Stage 5: write report.html, a page for any browser.
+    """Stage 5: write report.html, a page for any browser.
 
     \b
     Example:
@@ -208,7 +208,7 @@ def evaluate(
     mission: Mission, config: Config = None, settings: Set = None, seed: Seed = None, force: Force = False,
     quiet: Quiet = False, as_json: Json = False,
 ) -> None:  # fmt: skip
-    r"""Score hypotheses against the truth of the log.
+    """Score hypotheses against the truth of the log.
 
     Beside the rivals: Kalman + RTS, the bank alone, interpolation, hold.
 
@@ -229,14 +229,14 @@ def simulate(
     out: Out, config: Config = None, settings: Set = None, seed: Seed = None, force: Force = False, quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:  # fmt: skip
-    r"""Write mission logs from a simulated world.
+    """Write mission logs from a simulated world.
 
     A moving target, moving sensors, sparse detections, obstacles, and the truth.
 
     \b
     Examples:
       cadence simulate --out logs --seed 7
-      cadence simulate --out logs --set simulate.kind=patrol --set simulate.episodes=20
+      cadence simulate --out logs --set simulate.num_episodes=20 --set simulate.detection_rate=0.12
     """
     from pipeline.simulate import SimulateConfig
     from pipeline.simulate import simulate as stage
@@ -248,7 +248,7 @@ def simulate(
 def train(
     out: Out, config: Config = None, settings: Set = None, seed: Seed = None, quiet: Quiet = False, as_json: Json = False
 ) -> None:
-    r"""Train a checkpoint.
+    """Train a checkpoint.
 
     From a folder of logs with truth, or from the simulator. Continues after an interruption.
 
