@@ -18,6 +18,7 @@ from mcap.opcode import Opcode
 from cadence.errors import InputError
 from pipeline.logs.records import (
     MAGIC,
+    MAX_TIME_NS,
     MESSAGE_HEAD,
     DamagedRecord,
     parse_chunk,
@@ -102,7 +103,7 @@ class MissionLog:
     _metadata_spans: tuple[tuple[int, int], ...] = field(default=(), repr=False)
 
     def messages(
-        self, topics: Collection[str] | None = None, on_bytes: Callable[[int], None] | None = None
+        self, topics: Collection[str] | None = None, on_bytes: Callable[[int], object] | None = None
     ) -> Iterator[RawMessage]:
         """All messages of `topics` (None: of every topic) in log-time order, then in the order of the file.
 
@@ -125,7 +126,7 @@ class MissionLog:
         return tuple(found)
 
 
-def open_log(path: Path | str, on_bytes: Callable[[int], None] | None = None) -> MissionLog:
+def open_log(path: Path | str, on_bytes: Callable[[int], object] | None = None) -> MissionLog:
     """Walk the log at `path` once, checking every checksum; a damaged log opens too, and its health says what is lost.
 
     `on_bytes` is called as in `MissionLog.messages`. Raises `InputError` where there is no MCAP at `path`.
@@ -258,7 +259,7 @@ def _read(file: BinaryIO, offset: int, length: int) -> bytes:
 
 
 def _merge(
-    file: BinaryIO, blocks: tuple[Block, ...], wanted: Mapping[int, Channel], on_bytes: Callable[[int], None] | None
+    file: BinaryIO, blocks: tuple[Block, ...], wanted: Mapping[int, Channel], on_bytes: Callable[[int], object] | None
 ) -> Iterator[RawMessage]:
     """Messages of blocks sorted by start time; those of blocks that overlap wait in a heap."""
     waiting: list[tuple[int, int, int, RawMessage]] = []
@@ -295,5 +296,5 @@ def _slices(data: bytes, block: Block, wanted: Mapping[int, Channel]) -> Iterato
             continue
         channel_id, sequence, log_time, publish_time = unpack(data, begin)
         channel = wanted.get(channel_id)
-        if channel is not None:
+        if channel is not None and log_time <= MAX_TIME_NS:
             yield log_time, block.offset, begin, RawMessage(channel, log_time, publish_time, sequence, data[begin + size : end])

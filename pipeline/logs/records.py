@@ -28,6 +28,8 @@ CHUNK_HEAD: Final = struct.Struct("<QQQII")
 """Start time, end time, uncompressed size, CRC and length of the name of the compression."""
 MAX_CHUNK_BYTES: Final = 2**30
 """Largest chunk that is decompressed; recorders write a few megabytes."""
+MAX_TIME_NS: Final = 2**63 - 1
+"""Latest log time that can be used: times are int64 everywhere else (the year 2262)."""
 
 _FOREIGN = (
     McapError, ValueError, struct.error, zstandard.ZstdError, RuntimeError, EOFError, OverflowError, MemoryError,

@@ -21,6 +21,7 @@ from pipeline.logs.records import (
     CHUNK_HEAD,
     HEAD,
     MAGIC,
+    MAX_TIME_NS,
     MESSAGE_HEAD,
     DamagedRecord,
     StrictStream,
@@ -107,7 +108,7 @@ class Plan:
         return sum(sum(block.num_messages.values()) for block in self.blocks)
 
 
-def scan_log(path: Path, size: int, on_bytes: Callable[[int], None] | None = None) -> Plan:
+def scan_log(path: Path, size: int, on_bytes: Callable[[int], object] | None = None) -> Plan:
     """Walk the whole file; OSError is the caller's."""
     with path.open("rb") as file:
         scanner = _Scanner(file, size, on_bytes)
@@ -116,7 +117,7 @@ def scan_log(path: Path, size: int, on_bytes: Callable[[int], None] | None = Non
 
 
 class _Scanner:
-    def __init__(self, file: BinaryIO, size: int, on_bytes: Callable[[int], None] | None) -> None:
+    def __init__(self, file: BinaryIO, size: int, on_bytes: Callable[[int], object] | None) -> None:
         self.file, self.size, self.on_bytes = file, size, on_bytes
         self.plan = Plan()
         self.plan.summary, fault = read_summary(file, size)
@@ -129,7 +130,7 @@ class _Scanner:
         self.loose = _LooseRun()
         self.previous = 0  # opcode of the record before: a message index follows a chunk or another one
         self.broken_chunk: int | None = None  # index of the loss of the chunk just before, to be counted by its indexes
-        self.num_unknown = 0
+        self.num_unknown = self.num_timeless = 0
         self.seen: dict[bytes, None] = {}
 
     def run(self) -> None:
@@ -210,6 +211,9 @@ class _Scanner:
             if len(body) < MESSAGE_HEAD.size:
                 raise DamagedRecord("a message is too short")
             channel_id, _, log_time, _ = MESSAGE_HEAD.unpack_from(body)
+            if log_time > MAX_TIME_NS:
+                self.num_timeless += 1
+                return body
             self.loose.add(offset - HEAD.size, offset + len(body), channel_id, log_time)
             if self.loose.end - self.loose.begin > LOOSE_BLOCK_BYTES:
                 self._flush_loose()
@@ -271,6 +275,9 @@ class _Scanner:
         for opcode, begin, end in walk(data, is_cut):
             if opcode == Opcode.MESSAGE:
                 channel_id, _, log_time, _ = unpack(data, begin)
+                if log_time > MAX_TIME_NS:
+                    self.num_timeless += 1
+                    continue
                 counts[channel_id] += 1
                 is_sorted = is_sorted and log_time >= previous
                 previous = log_time
@@ -405,6 +412,8 @@ class _Scanner:
         plan, summary = self.plan, self.plan.summary
         if not plan.reached_end and not plan.losses:
             plan.doubts.append("The file ends without its end mark: the recording was cut off.")
+        if self.num_timeless:
+            plan.doubts.append(f"{self.num_timeless} messages have log times after the year 2262 and cannot be used.")
         if summary is None or summary.statistics is None:
             if self.num_unknown:
                 plan.doubts.append(f"{self.num_unknown} unknown records were skipped; no statistics tell whether any mattered.")
