@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from pyproj import Transformer
 
-from cadence.errors import ConfigError, InputError
+from cadence.errors import InputError
 from pipeline.tables import Frame
 
 FloatArray = npt.NDArray[np.float64]
@@ -27,11 +27,9 @@ DATUM_DECIMALS = 4
 def georeferenced_frame(latitude_deg: FloatArray, longitude_deg: FloatArray, datum: tuple[float, float] | None = None) -> Frame:
     """The mission frame about `datum` (latitude, longitude; degrees), or about the median of the positions [N].
 
-    Raises `ConfigError` for a datum that is not on earth, `InputError` without any position.
+    Raises `InputError` without either.
     """
     if datum is not None:
-        if not (abs(datum[0]) <= 90 and abs(datum[1]) <= 180):
-            raise ConfigError(f"extract.datum = {list(datum)}: expected [latitude, longitude] in degrees")
         return Frame(GEOREFERENCED_FRAME_ID, datum[0], datum[1])
     if latitude_deg.size == 0:
         raise InputError("no position in latitude and longitude to choose a datum from; set extract.datum")

@@ -152,7 +152,8 @@ class ChannelReader:
                 firsts, seconds, self._spread(self.position[2], message, num), self._covariances(message, num),
                 self._spread(self.fields["score"], message, num), self._times(message, raw, num),
                 self._names(message, num, "agent"), self._names(message, num, "sensor"),
-                self._spread(self.fields["frame_id"], message, num), self._spread(self.fields["status"], message, num), strict=True,
+                self._spread(self.fields["frame_id"], message, num), self._spread(self.fields["status"], message, num),
+                strict=True,
             )  # fmt: skip
         except _LengthError:
             self.counts["incomplete"] += 1
@@ -165,7 +166,7 @@ class ChannelReader:
             self.rows.floats.extend((_number(first), _number(second), _number(z), *covariance, _number(score)))
             self.rows.agents.append(agent)
             self.rows.sensors.append(sensor)
-            self.rows.frame_ids.append(frame_id if isinstance(frame_id, str) else "")
+            self.rows.frame_ids.append(frame_id.lstrip("/") if isinstance(frame_id, str) else "")  # ROS 1 wrote /map
 
     def check(self) -> None:
         """`ConfigError` where something that the user stated was in no message."""

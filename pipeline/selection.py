@@ -1,7 +1,6 @@
 """Which sources serve which role for one log: what the user states, and what the channels suggest for the rest."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 
 from cadence.errors import ConfigError, InputError
 from pipeline.logs.reader import Channel
@@ -10,59 +9,55 @@ from pipeline.positions import ChannelReader
 from pipeline.sources import SourceConfig
 from pipeline.thinning import ThinningConfig
 
-STATED_ROLES = ("detections", "truth", "poses")
+ROLES = ("detections", "truth", "poses")
 
 
-@dataclass(frozen=True)
-class Stated:
-    """The user's `[extract]` sources of each role; `suggest` lets the names of topics fill the roles left empty."""
-
-    detections: tuple[SourceConfig, ...]
-    truth: tuple[SourceConfig, ...]
-    poses: tuple[SourceConfig, ...]
-    suggest: bool
-    thinning: ThinningConfig
+Sources = Mapping[str, tuple[SourceConfig, ...]]
+"""Sources by role: "detections", "truth", "poses"."""
 
 
-def select_readers(stated: Stated, channels: Sequence[Channel]) -> tuple[ChannelReader, ...]:
-    """A reader for every channel of every role.
+def select_readers(
+    stated: Sources, suggest: bool, thinning: ThinningConfig, channels: Sequence[Channel]
+) -> tuple[ChannelReader, ...]:
+    """A reader for every channel of every role; with `suggest`, the names of topics fill the roles that the user left empty.
 
     Raises `ConfigError` where a stated topic is not in the log or its schema needs paths, `InputError` where nothing can
     serve as detections; both name the channels and what to write.
     """
     suggested = suggest_mapping(channels)
-    taken = {c.topic for role in STATED_ROLES for source in getattr(stated, role) for c in channels if source.match(c.topic) is not None}
-    chosen = {role: _sources(role, stated, suggested, channels, taken) for role in STATED_ROLES}
-    thins_truth = stated.thinning.enabled and stated.thinning.thin_from == "truth"
-    if thins_truth:
+    taken = _topics([source for sources in stated.values() for source in sources], channels)
+    chosen = {role: stated[role] for role in ROLES}
+    for role in ROLES:
+        if suggest and not stated[role]:
+            chosen[role] = _untaken(getattr(suggested, role), channels, taken)
+    if thinning.enabled and thinning.thin_from == "truth":
         if not chosen["truth"]:
             chosen["truth"] = _dense(suggested, channels, taken, bool(chosen["detections"]))
-            dense = {c.topic for c in channels if any(source.match(c.topic) is not None for source in chosen["truth"])}
-            chosen["poses"] = tuple(s for s in chosen["poses"] if not any(s.match(topic) is not None for topic in dense))
+            chosen["poses"] = _untaken(chosen["poses"], channels, _topics(chosen["truth"], channels))
         chosen["detections"] = ()
     elif not chosen["detections"]:
         raise InputError(_no_detections(suggested, channels))
-    return tuple(
-        reader for role in STATED_ROLES for source in chosen[role]
-        for reader in _readers(role, source, bool(getattr(stated, role)), channels)
-    )  # fmt: skip
+    readers = []
+    for role in ROLES:
+        for source in chosen[role]:
+            readers += _readers(role, source, bool(stated[role]), channels)
+    return tuple(readers)
 
 
-def _sources(
-    role: str, stated: Stated, suggested: SuggestedMapping, channels: Sequence[Channel], taken: set[str]
-) -> tuple[SourceConfig, ...]:
-    sources: tuple[SourceConfig, ...] = getattr(stated, role)
-    if sources or not stated.suggest:
-        return sources
-    found: tuple[SourceConfig, ...] = getattr(suggested, role)
-    return tuple(s for s in found if not any(s.match(topic) is not None for topic in taken))
+def _topics(sources: Sequence[SourceConfig], channels: Sequence[Channel]) -> set[str]:
+    return {channel.topic for channel in channels if any(source.match(channel.topic) is not None for source in sources)}
+
+
+def _untaken(sources: tuple[SourceConfig, ...], channels: Sequence[Channel], taken: set[str]) -> tuple[SourceConfig, ...]:
+    """The sources none of whose topics is `taken`."""
+    return tuple(source for source in sources if not taken & _topics([source], channels))
 
 
 def _dense(
     suggested: SuggestedMapping, channels: Sequence[Channel], taken: set[str], has_detections: bool
 ) -> tuple[SourceConfig, ...]:
     """The only position channel (or the channels of one pattern): what is thinned where no truth is named."""
-    dense = tuple(s for s in dense_sources(channels, suggested) if not any(s.match(topic) is not None for topic in taken))
+    dense = _untaken(dense_sources(channels, suggested), channels, taken)
     if has_detections:
         raise InputError(
             "thinning: the log has detections but no truth to thin; name a dense channel under [[extract.truth]], or thin the "
@@ -71,7 +66,7 @@ def _dense(
     if len(dense) != 1:
         found = "several dense position channels" if dense else "no position channel that could be thinned"
         topics = ", ".join(source.topic for source in dense) or describe_channels(channels)
-        raise InputError(f"thinning: {found}: {topics}; name one: [[extract.truth]] topic = \"/...\" (see cadence info)")
+        raise InputError(f'thinning: {found}: {topics}; name one: [[extract.truth]] topic = "/..." (see cadence info)')
     return dense
 
 
@@ -90,7 +85,10 @@ def _no_detections(suggested: SuggestedMapping, channels: Sequence[Channel]) -> 
     if unread:
         paths = 'add [[extract.detections]] with topic, x = "path", y = "path" (or latitude, longitude)'
         return f"no preset knows the schema of {', '.join(unread)}; {paths}; cadence info LOG prints the lines"
-    dense = [source.topic for role in ("truth", "poses", "positions") for source in getattr(suggested, role)]
-    advice = f"add [[extract.detections]] with topic = {dense[0] if dense else '/...'!r}"
-    advice += " and its message paths" if not dense else ", or thin the dense channel with --set extract.thinning.enabled=true"
+    dense = [source.topic for source in (*suggested.truth, *dense_sources(channels, suggested))]
+    if not dense:
+        advice = 'add [[extract.detections]] with topic = "/...", x = "path", y = "path" (or latitude, longitude)'
+    else:
+        entry = f'add [[extract.detections]] with topic = "{dense[0]}"'
+        advice = f"{entry}, or make sparse detections of a dense channel with --set extract.thinning.enabled=true"
     return f"nothing looks like detections among {describe_channels(channels)}; {advice}; cadence info LOG prints the lines"

@@ -1,0 +1,266 @@
+"""Extract: catalogue and log → detections.parquet, truth.parquet, poses.parquet, obstacles.json.
+
+Decoded messages become rows in the mission frame, sorted by time; whatever is left out is counted in the summary.
+"""
+
+import json
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+
+from cadence.errors import InputError
+from pipeline.collapse import Collapsed, collapse
+from pipeline.ingest import CATALOGUE_NAME, open_catalogued_log, read_catalogue
+from pipeline.logs.reader import MissionLog
+from pipeline.manifest import StageResult, run_stage
+from pipeline.placement import mission_frame, place
+from pipeline.positions import ChannelReader, Positions, Rows, read_positions
+from pipeline.progress import Progress
+from pipeline.selection import ROLES, select_readers
+from pipeline.sources import SourceConfig
+from pipeline.tables import Frame, write_table
+from pipeline.thinning import ThinningConfig, is_seen, noise
+from schemas.tables import DETECTIONS, POSES, TRUTH
+
+_STAMPS_APART_S = 3600.0
+
+
+@dataclass(frozen=True)
+class ExtractConfig:
+    """What to take from a log.
+
+    detections, truth, poses   sources; a role left empty is filled by what the names of the topics suggest (see suggest)
+    thinning         make sparse detections out of a dense channel
+    simultaneity_s   detections of one agent within this time are collapsed into one
+    start_s, end_s   use only this part of the mission, in seconds after the log's first message
+    default_sigma_m  standard deviation of detections that state none; without it they count as exact
+    datum            [latitude, longitude] in degrees of x = y = 0; by default the median of all positions, and unknown for
+                     logs in metres
+    """
+
+    detections: tuple[SourceConfig, ...] = ()
+    truth: tuple[SourceConfig, ...] = ()
+    poses: tuple[SourceConfig, ...] = ()
+    suggest: bool = True
+    thinning: ThinningConfig = field(default_factory=ThinningConfig)
+    simultaneity_s: float = 0.001
+    start_s: float | None = None
+    end_s: float | None = None
+    default_sigma_m: float | None = None
+    datum: tuple[float, float] | None = None
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.simultaneity_s < np.inf:
+            raise ValueError("simultaneity_s must not be negative")
+        if self.default_sigma_m is not None and not 0 < self.default_sigma_m < np.inf:
+            raise ValueError("default_sigma_m must be positive")
+        if self.start_s is not None and self.end_s is not None and not self.start_s < self.end_s:
+            raise ValueError("start_s must be smaller than end_s")
+        if self.datum is not None and not (abs(self.datum[0]) <= 90 and abs(self.datum[1]) <= 180):
+            raise ValueError(f"datum {list(self.datum)}: expected [latitude, longitude] in degrees")
+
+
+def extract(directory: Path, config: ExtractConfig, progress: Progress, force: bool = False) -> StageResult:
+    """Write the tables of the log that `directory` was ingested from. Raises `InputError` where no detection is left."""
+    catalogue = read_catalogue(directory)
+
+    def body(work: Path) -> dict[str, Any]:
+        return write_tables(open_catalogued_log(catalogue), work, config, progress)
+
+    return run_stage("extract", directory, config=config, inputs=[directory / CATALOGUE_NAME], body=body, force=force)
+
+
+def write_tables(log: MissionLog, folder: Path, config: ExtractConfig, progress: Progress) -> dict[str, Any]:
+    """Write the files of the stage for `log` into `folder`; the summary."""
+    stated = {"detections": config.detections, "truth": config.truth, "poses": config.poses}
+    readers = select_readers(stated, config.suggest, config.thinning, log.channels)
+    counts = read_positions(log, readers, progress)
+    rows = {role: _columns(role, readers, log, config, counts) for role in ROLES}
+    primary = "truth" if config.thinning.enabled and config.thinning.thin_from == "truth" else "detections"
+    _check_any(log, primary, rows[primary], counts, config)
+    frame = mission_frame(rows[primary], [rows[role] for role in ROLES if role != primary], config.datum)
+    for role in ROLES:
+        rows[role] = _placed(role, rows[role], frame, counts)
+    if config.thinning.enabled:
+        rows["detections"] = _thinned(rows[primary], config.thinning)
+        if len(rows["detections"]) == 0:
+            raise InputError(
+                f"{log.path}: thinning left no detection; choose a smaller extract.thinning.mean_gap_s or another seed"
+            )
+    detections = collapse(_with_default_sigma(rows["detections"], config.default_sigma_m), config.simultaneity_s)
+    counts["collapsed"] = len(rows["detections"]) - len(detections.positions)
+    truth, counts["duplicate_truth"] = _without_repeats(rows["truth"])
+    log_id = log.path.stem
+    write_table(_detection_table(log_id, detections), folder / "detections.parquet", "detections", frame)
+    if len(truth):
+        write_table(_track_table(log_id, truth, "agent_id", truth.agent, TRUTH), folder / "truth.parquet", "truth", frame)
+    poses = rows["poses"]
+    if len(poses):
+        write_table(_track_table(log_id, poses, "sensor_id", poses.sensor, POSES), folder / "poses.parquet", "poses", frame)
+    obstacles: list[Mapping[str, Any]] = []
+    text = json.dumps({"version": 1, "obstacles": obstacles}, indent=1) + "\n"
+    (folder / "obstacles.json").write_text(text, encoding="utf-8")
+    _tell(counts, detections.positions, log, progress)
+    return _summary(log, readers, detections.positions, truth, poses, frame, counts, len(obstacles))
+
+
+def _columns(
+    role: str, readers: Sequence[ChannelReader], log: MissionLog, config: ExtractConfig, counts: Counter[str]
+) -> Positions:
+    """All finite rows of a role inside the time cut, sorted by time."""
+    parts = [reader.finish() for reader in readers if reader.role == role]
+    counts["out_of_order"] += sum(int((part.time_ns < np.maximum.accumulate(part.time_ns)).sum()) for part in parts)
+    rows = Positions.concatenate(parts or [Rows().finish("", False, False)])
+    is_finite = np.isfinite(rows.first) & np.isfinite(rows.second)
+    # A latitude off the earth is as little a position as NaN.
+    is_finite &= ~rows.is_geodetic | ((np.abs(rows.first) <= 90) & (np.abs(rows.second) <= 360))
+    counts["dropped_nonfinite"] += int((~is_finite).sum())
+    counts[f"finite_{role}"] = int(is_finite.sum())
+    after_s = (rows.time_ns - log.start_ns) * 1e-9
+    is_inside = (after_s >= (-np.inf if config.start_s is None else config.start_s)) & (
+        after_s <= (np.inf if config.end_s is None else config.end_s)
+    )
+    counts["outside_time_cut"] += int((is_finite & ~is_inside).sum())
+    rows = rows[is_finite & is_inside]
+    return rows[np.argsort(rows.time_ns, kind="stable")]
+
+
+def _check_any(log: MissionLog, role: str, rows: Positions, counts: Counter[str], config: ExtractConfig) -> None:
+    if len(rows):
+        return
+    if counts[f"finite_{role}"]:
+        reason = "no detection lies inside extract.start_s and extract.end_s; widen them"
+    elif counts["dropped_nonfinite"]:
+        reason = "every position is NaN, infinite or off the earth; check the recorder, or map another topic"
+    elif counts["undecodable"]:
+        reason = "no message of the mapped topics can be decoded; map another topic (cadence info lists them)"
+    elif counts["no_fix"]:
+        reason = "every position is marked as having no fix; map another topic (cadence info lists them)"
+    elif counts["incomplete"]:
+        reason = "no message of the mapped topics has a position where the mapping looks for it; correct the [extract] entries"
+    else:
+        reason = f"the topics mapped as {role} hold no message; map another topic (cadence info lists them)"
+    raise InputError(f"{log.path}: {reason}")
+
+
+def _placed(role: str, rows: Positions, frame: Frame, counts: Counter[str]) -> Positions:
+    """Rows in the mission frame. What the user asked for must fit; what was only suggested is left out and counted."""
+    placed, num_elsewhere = place(rows, frame)
+    if num_elsewhere and rows.is_stated.any():
+        raise InputError(
+            f"{role}: {num_elsewhere} positions are not in the mission frame {frame.frame_id!r}, and transforms are not "
+            f"applied; take those topics out of [[extract.{role}]]"
+        )
+    counts["other_frame"] += num_elsewhere
+    return placed
+
+
+def _thinned(rows: Positions, config: ThinningConfig) -> Positions:
+    """The rows that fall into bursts, with noise."""
+    if any(agent is None for agent in rows.agent):
+        raise InputError(
+            "thinning: some detections have no agent; give agent or agent_path, or set extract.thinning.enabled=false"
+        )
+    is_kept = np.zeros(len(rows), dtype=np.bool_)
+    first, second = rows.first.copy(), rows.second.copy()
+    for agent in sorted(set(rows.agent)):
+        of_agent = np.flatnonzero(rows.agent == agent)
+        is_kept[of_agent] = is_seen(rows.time_ns[of_agent], agent, config)
+        if config.noise_m > 0:
+            added = noise(len(of_agent), agent, config)
+            first[of_agent] += added[:, 0]
+            second[of_agent] += added[:, 1]
+    covariance = rows.covariance_m2
+    if config.variance_m2 > 0:
+        covariance = np.nan_to_num(covariance, nan=0.0) + np.array([config.variance_m2, 0.0, config.variance_m2])
+    return replace(rows, first=first, second=second, covariance_m2=covariance)[is_kept]
+
+
+def _with_default_sigma(rows: Positions, sigma_m: float | None) -> Positions:
+    if sigma_m is None:
+        return rows
+    covariance = rows.covariance_m2.copy()
+    covariance[np.isnan(covariance[:, 0])] = (sigma_m**2, 0.0, sigma_m**2)
+    return replace(rows, covariance_m2=covariance)
+
+
+def _without_repeats(rows: Positions) -> tuple[Positions, int]:
+    """Truth with one row an agent and time (the first), and the number of rows left out."""
+    _, agent = np.unique(rows.agent.astype(np.str_), return_inverse=True)
+    _, kept = np.unique(np.column_stack([rows.time_ns, agent]), axis=0, return_index=True)
+    return rows[np.sort(kept)], len(rows) - len(kept)
+
+
+def _detection_table(log_id: str, collapsed: Collapsed) -> pa.Table:
+    rows = collapsed.positions
+    columns = {
+        "log_id": pa.array([log_id] * len(rows)), "time_ns": rows.time_ns, "sensor_id": rows.sensor, "agent_id": rows.agent,
+        "x_m": rows.first, "y_m": rows.second, "z_m": rows.z_m, "cov_xx_m2": rows.covariance_m2[:, 0],
+        "cov_xy_m2": rows.covariance_m2[:, 1], "cov_yy_m2": rows.covariance_m2[:, 2], "score": rows.score,
+        "num_merged": collapsed.num_merged, "topic": rows.topic, "log_time_ns": rows.log_time_ns, "sequence": rows.sequence,
+    }  # fmt: skip
+    return _table(columns, DETECTIONS)
+
+
+def _track_table(log_id: str, rows: Positions, key: str, names: npt.NDArray[np.object_], schema: pa.Schema) -> pa.Table:
+    columns = {
+        "log_id": pa.array([log_id] * len(rows)), "time_ns": rows.time_ns, key: names,
+        "x_m": rows.first, "y_m": rows.second, "z_m": rows.z_m,
+    }  # fmt: skip
+    return _table(columns, schema)
+
+
+def _table(columns: Mapping[str, Any], schema: pa.Schema) -> pa.Table:
+    """NaN becomes null."""
+    return pa.table([pa.array(columns[item.name], type=item.type, from_pandas=True) for item in schema], schema=schema)
+
+
+def _tell(counts: Counter[str], detections: Positions, log: MissionLog, progress: Progress) -> None:
+    """One line for each kind of thing that was left out."""
+    meanings = {
+        "dropped_nonfinite": "positions are NaN, infinite or off the earth and were skipped",
+        "incomplete": "messages have no position where the mapping looks for it and were skipped",
+        "undecodable": "messages cannot be decoded and were skipped",
+        "no_fix": "positions are marked as having no fix and were skipped",
+        "bad_covariance": "covariances are not positive definite and were replaced by the default",
+        "out_of_order": "time stamps were out of order and were sorted",
+        "other_frame": "positions are in another frame than the detections and were skipped",
+    }
+    for name, meaning in meanings.items():
+        if counts[name]:
+            progress.note(f"extract: {counts[name]} {meaning}")
+    apart_s = float(np.median(np.abs(detections.time_ns - detections.log_time_ns))) * 1e-9
+    if apart_s > _STAMPS_APART_S:
+        advice = 'to use the log times give the source time = "log_time"'
+        progress.note(f"extract: stamps and log times are {apart_s:.0f} s apart; the stamps are used; {advice}")
+    for problem in log.health.problems:
+        progress.note(f"extract: {problem}")
+
+
+def _summary(
+    log: MissionLog, readers: Sequence[ChannelReader], detections: Positions, truth: Positions, poses: Positions, frame: Frame,
+    counts: Counter[str], num_obstacles: int,
+) -> dict[str, Any]:  # fmt: skip
+    agents = {agent for agent in detections.agent if agent is not None}
+    span_s = float(detections.time_ns[-1] - detections.time_ns[0]) * 1e-9
+    names = ("undecodable", "incomplete", "no_fix", "dropped_nonfinite", "bad_covariance", "out_of_order", "outside_time_cut")
+    return {
+        "num_detections": len(detections),
+        "num_truth": len(truth),
+        "num_poses": len(poses),
+        "num_obstacles": num_obstacles,
+        "num_agents": len(agents),
+        "num_unknown_origin": sum(agent is None for agent in detections.agent),
+        "span_s": span_s,
+        "frame": {"frame_id": frame.frame_id, "latitude_deg": frame.latitude_deg, "longitude_deg": frame.longitude_deg},
+        "sources": {role: sorted({r.source.topic for r in readers if r.role == role}) for role in ROLES},
+        **{name: counts[name] for name in (*names, "other_frame", "collapsed", "duplicate_truth")},
+        "lost_spans_ns": [list(span) for span in log.health.lost_spans_ns],
+        "is_complete": log.health.is_complete,
+    }
