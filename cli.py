@@ -11,7 +11,7 @@ import typer
 from cadence.errors import CadenceError, UsageError
 from pipeline.config import stage_config
 from pipeline.manifest import StageResult
-from pipeline.missions import mission_directories
+from pipeline.missions import is_mission_directory, mission_directories
 from pipeline.progress import Progress
 from pipeline.summaries import log_record, log_summary, stage_summary, to_json
 
@@ -205,23 +205,27 @@ def report(
 
 @app.command()
 def evaluate(
-    mission: Mission, config: Config = None, settings: Set = None, seed: Seed = None, force: Force = False,
-    quiet: Quiet = False, as_json: Json = False,
+    mission: Annotated[Path, typer.Argument(metavar="MISSION", help="Mission directory, or a folder of them.", show_default=False)],
+    config: Config = None, settings: Set = None, seed: Seed = None, force: Force = False, quiet: Quiet = False,
+    as_json: Json = False,
 ) -> None:  # fmt: skip
     """Score hypotheses against the truth of the log.
 
-    Beside the rivals: Kalman + RTS, the bank alone, interpolation, hold.
+    Beside the rivals: Kalman + RTS, the bank alone, interpolation, hold. A folder of missions gets one pooled table.
 
     \b
-    Example:
+    Examples:
       cadence evaluate results/flight
+      cadence evaluate results
     """
-    from pipeline.evaluate import EvaluateConfig
+    from pipeline.evaluate import EvaluateConfig, evaluate_folder
     from pipeline.evaluate import evaluate as stage
 
-    _show(
-        stage(mission, stage_config(EvaluateConfig, "evaluate", config, settings or (), seed), Progress(quiet), force), as_json
-    )
+    resolved = stage_config(EvaluateConfig, "evaluate", config, settings or (), seed)
+    if is_mission_directory(mission):
+        _show(stage(mission, resolved, Progress(quiet), force), as_json)
+    else:
+        _show(evaluate_folder(mission, resolved, Progress(quiet)), as_json)
 
 
 @app.command()

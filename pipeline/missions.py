@@ -23,3 +23,8 @@ def mission_directories(logs: Sequence[Path], out: Path) -> dict[Path, Path]:
         suffix = "-" + hashlib.sha256(str(log).encode()).hexdigest()[:8] if is_shared else ""
         directories[distinct[log]] = out / f"{log.stem}{suffix}"
     return directories
+
+
+def is_mission_directory(path: Path) -> bool:
+    """Whether a log was ingested into `path`, as opposed to a folder of mission directories."""
+    return (path / "catalogue.json").is_file()

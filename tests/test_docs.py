@@ -11,6 +11,7 @@ import typer.main
 
 import cli
 from pipeline.config import TABLES, merge_overrides, read_config
+from schemas import channels, tables
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "docs"))
@@ -30,10 +31,8 @@ def blocks(text: str, *languages: str) -> list[str]:
 
 
 def shell_lines(text: str) -> list[str]:
-    joined = "\n".join(blocks(text, "sh", "console", "bash")).replace("\\\n", " ")
-    return [
-        line.removeprefix("$ ").strip() for line in joined.splitlines() if line.strip() and not line.lstrip().startswith("#")
-    ]
+    lines = "\n".join(blocks(text, "sh", "console", "bash")).replace("\\\n", " ").splitlines()
+    return [line.removeprefix("$ ").strip() for line in lines if line.strip() and not line.lstrip().startswith("#")]
 
 
 def quoted(text: str) -> list[str]:
@@ -111,8 +110,8 @@ def assert_accepted(words: list[str], line: str) -> None:
     assert_tables_fit(merge_overrides({}, context.params.get("settings") or ()), line)
 
 
-def assert_tables_fit(tables: dict, where: str) -> None:
-    for name, table in tables.items():
+def assert_tables_fit(configuration: dict, where: str) -> None:
+    for name, table in configuration.items():
         assert name in TABLES, f"{where}: no table {name}"
         read_config(generate.stage_config_class(name), table, name)
 
@@ -125,10 +124,8 @@ def test_configuration_examples_are_accepted(page):
 
 @every_page
 def test_flags_and_settings_in_sentences_exist(page):
-    known_flags = {flag for command in COMMANDS.values() for option in command.params for flag in option.opts} | {
-        "--version",
-        "--help",
-    }
+    known_flags = {flag for command in COMMANDS.values() for option in command.params for flag in option.opts}
+    known_flags |= {"--version", "--help"}
     for words in quoted(page.read_text(encoding="utf-8")):
         flag = re.match(r"--[a-z-]+", words)
         if flag and name_of(page) != "CONTRIBUTING.md":
@@ -154,10 +151,20 @@ def test_files_that_are_named_exist(page):
 def test_architecture_names_every_package_and_stage():
     text = (ROOT / "ARCHITECTURE.md").read_text(encoding="utf-8")
     packages = [path.parent for layer in ("cadence", "pipeline", "schemas") for path in (ROOT / layer).rglob("__init__.py")]
-    assert all(f"{name_of(package)}/" in text for package in packages), [
-        name_of(p) for p in packages if f"{name_of(p)}/" not in text
-    ]
+    missing = [name_of(package) for package in packages if f"{name_of(package)}/" not in text]
+    assert not missing
     assert all(f"pipeline/{table}" in text for table in TABLES)
+
+
+def test_formats_page_names_every_column_topic_and_field():
+    text = (ROOT / "docs" / "formats.md").read_text(encoding="utf-8")
+    schemas = (tables.DETECTIONS, tables.TRUTH, tables.POSES, tables.WINDOWS, tables.hypotheses_schema(1))
+    names = {name for schema in schemas for name in schema.names}
+    names |= {value.topic for value in vars(channels).values() if isinstance(value, channels.Channel)}
+    for kind in ("Hypotheses", "Agents", "Detection"):
+        descriptor = channels.message_class(f"cadence.{kind}").DESCRIPTOR
+        names |= {field.name for field in descriptor.fields}
+    assert not sorted(name for name in names if f"`{name}`" not in text)
 
 
 def test_changelog_starts_with_this_version():
