@@ -54,9 +54,7 @@ def bootstrap_ratio(
     return Interval(_quotient(sums.sum(axis=0)).item(), low, high, int(is_valid.sum()), num_groups)
 
 
-def _percentiles(
-    sums: NDArray[np.float64], rng: np.random.Generator, num_resamples: int, level: float
-) -> tuple[float, float]:
+def _percentiles(sums: NDArray[np.float64], rng: np.random.Generator, num_resamples: int, level: float) -> tuple[float, float]:
     num_groups = len(sums)
     block = max(1, _MAX_DRAWS // num_groups)
     totals = [

@@ -24,9 +24,7 @@ def mean_error(position_m: Tensor, weight: Tensor, truth_m: Tensor) -> Tensor:
     return error
 
 
-def min_ade_distance(
-    position_m: Tensor, weight: Tensor, truth_m: Tensor, is_known: Tensor, is_joint: bool = False
-) -> Tensor:
+def min_ade_distance(position_m: Tensor, weight: Tensor, truth_m: Tensor, is_known: Tensor, is_joint: bool = False) -> Tensor:
     """Distance at every step of the hypothesis with the least summed error over the known steps, metres [B, A, T].
 
     The hypothesis is chosen for each agent, or with `is_joint` once for all of a window's agents. Hypotheses of weight

@@ -1,0 +1,207 @@
+"""Score the hypotheses of a mission against its truth, beside the rivals on the same windows.
+
+Reads hypotheses, windows, detections and truth (*.parquet); writes scores.json (everything), scores.csv (the same rows
+for a spreadsheet) and scores.md (what a person reads first). `evaluate_folder` pools the missions of a folder.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import torch
+from torch import Tensor
+
+from cadence.bank.bank import Bank
+from cadence.baselines.interpolation import Hold, LinearInterpolation
+from cadence.errors import InputError
+from cadence.types import Detections, Estimator, HypothesisSet
+from pipeline.manifest import StageResult, read_manifest, run_stage, write_atomic
+from pipeline.progress import Progress
+from pipeline.results import MissionHypotheses, read_hypothesis_tables
+from pipeline.score_tables import OWN_NAME, ScoredMission, as_csv, as_json, as_markdown, headline, pool
+from pipeline.scores import compare, score_in_chunks
+from pipeline.tables import read_table
+from pipeline.windows import UNKNOWN_AGENT, Grid, MissionWindows, build_windows, fit_tracks, truth_on_grid
+
+_TRUTH_GAP_STEPS = 2.0
+
+
+@dataclass(frozen=True)
+class EvaluateConfig:
+    """What is scored, and beside whom.
+
+    rivals           names out of `RIVALS`, fitted to the mission's detections; an empty list scores the hypotheses alone
+    max_truth_gap_s  truth is interpolated between samples at most this far apart; by default two steps, or twice the median
+                     time between truth samples where that is longer
+    num_resamples    bootstrap resamples of an interval
+    seed             of the rivals' samples and of the bootstrap
+    """
+
+    rivals: tuple[str, ...] = ("bank", "linear", "hold")
+    max_truth_gap_s: float | None = None
+    num_resamples: int = 1000
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        unknown = [name for name in self.rivals if name not in RIVALS]
+        if unknown:
+            raise ValueError(f"rival {unknown[0]!r} is not known; known rivals: {', '.join(RIVALS)}")
+        if self.max_truth_gap_s is not None and not self.max_truth_gap_s > 0:
+            raise ValueError(f"max_truth_gap_s must be positive, got {self.max_truth_gap_s}")
+        if self.num_resamples < 1:
+            raise ValueError(f"num_resamples must be at least 1, got {self.num_resamples}")
+
+
+RIVALS: Mapping[str, Callable[[Detections, float], Estimator]] = {
+    "bank": lambda tracks, step_s: Bank().fit(tracks, step_s),
+    "linear": lambda tracks, step_s: LinearInterpolation().fit(tracks),
+    "hold": lambda tracks, step_s: Hold().fit(tracks),
+}
+"""Rivals by name: fitted to stretches of detections [R, 1, N] for windows of the given step."""
+
+
+def evaluate(directory: Path, config: EvaluateConfig, progress: Progress, force: bool = False) -> StageResult:
+    """Score one mission directory; writes scores.json, scores.csv and scores.md."""
+    inputs = [directory / f"{name}.parquet" for name in ("hypotheses", "windows", "detections", "truth")]
+    if not inputs[-1].is_file():
+        raise InputError(
+            f"{inputs[-1]}: not found, so there is nothing to score against; name a truth channel in [[extract.truth]] "
+            "or thin a dense one (extract.thinning), then run extract and infer again"
+        )
+    inputs += [path for path in [directory / "obstacles.json"] if path.is_file()]
+
+    def body(work: Path) -> Mapping[str, Any]:
+        scored = score_mission(directory, config, progress)
+        return _write_scores([scored], work, config)
+
+    return run_stage("evaluate", directory, config=config, inputs=inputs, body=body, force=force)
+
+
+def evaluate_folder(folder: Path, config: EvaluateConfig, progress: Progress) -> StageResult:
+    """Pooled scores of all mission directories in `folder`, written there; intervals over logs where there are six or more."""
+    directories = sorted(path.parent for path in folder.glob("*/hypotheses.parquet"))
+    if not directories:
+        raise InputError(f"{folder}: holds no mission directory with hypotheses.parquet; run cadence run --out {folder} first")
+    scored = []
+    with progress.bar(len(directories), "evaluate", "log") as bar:
+        for directory in directories:
+            scored.append(score_mission(directory, config, progress))
+            bar.update(1)
+    summary = _write_scores(scored, folder, config)
+    outputs = tuple(folder / f"scores.{suffix}" for suffix in ("csv", "json", "md"))
+    return StageResult("evaluate", "done", outputs, summary)
+
+
+def score_mission(directory: Path, config: EvaluateConfig, progress: Progress) -> ScoredMission:
+    """Cells of one mission directory, for the stored hypotheses and for the rivals of `config`."""
+    stored = read_hypothesis_tables(directory)
+    detections, _ = read_table(directory / "detections.parquet", "detections")
+    truth, _ = read_table(directory / "truth.parquet", "truth")
+    grid = _stored_grid(stored, directory)
+    sigma_m = _default_sigma_m(directory)
+    windows = build_windows(detections, grid, config.seed, sigma_m)
+    truth = _named_like(truth, windows.agent_ids, directory)
+    max_gap_s = config.max_truth_gap_s or default_truth_gap_s(truth, grid.step_s)
+    truth_m, is_known = truth_on_grid(truth, windows, max_gap_s)
+    num_hypotheses = max(len(window.hypothesis) for window in stored.windows)
+
+    def draw(index: Tensor) -> HypothesisSet:
+        return _stored_hypotheses(stored, windows, index, num_hypotheses)
+
+    with progress.bar(windows.batch.num_windows * (1 + len(config.rivals)), "evaluate", "window") as bar:
+        own = score_in_chunks(draw, windows.batch, truth_m, is_known, num_hypotheses, None, bar.update)
+        if not len(own):
+            raise InputError(
+                f"{directory}: no step has both hypotheses and truth (truth samples at most {max_gap_s:g} s apart); "
+                "check that the truth channel overlaps the detections in time, or set evaluate.max_truth_gap_s"
+            )
+        is_scored = torch.zeros(is_known.shape[:2], dtype=torch.bool)
+        is_scored[torch.from_numpy(own.window.astype(np.int64)), torch.from_numpy(own.agent.astype(np.int64))] = True
+        tracks = fit_tracks(detections, grid, sigma_m)
+        rivals = {name: RIVALS[name](tracks, grid.step_s) for name in config.rivals}
+        cells = compare(rivals, windows.batch, truth_m, is_known & is_scored[..., None], num_hypotheses, None, bar.update)
+    is_asked = is_known.any(dim=-1) & windows.batch.is_active
+    return ScoredMission(
+        log_id=next((window.log_id for window in stored.windows), directory.name),
+        step_s=grid.step_s,
+        num_windows=windows.batch.num_windows,
+        agent_ids=windows.agent_ids,
+        num_hypotheses=num_hypotheses,
+        max_truth_gap_s=max_gap_s,
+        num_unscored=int((is_asked & ~is_scored).sum()),
+        cells={OWN_NAME: own, **cells},
+    )
+
+
+def default_truth_gap_s(truth: pa.Table, step_s: float) -> float:
+    """Two steps, or twice the median time between an agent's truth samples where that is longer."""
+    order = truth.sort_by([("agent_id", "ascending"), ("time_ns", "ascending")])
+    agent = order["agent_id"].combine_chunks().dictionary_encode()
+    codes = pa.chunked_array([agent] if isinstance(agent, pa.Array) else agent.chunks).unify_dictionaries()
+    index = np.concatenate([chunk.indices.to_numpy() for chunk in codes.chunks]) if truth.num_rows else np.zeros(0, np.int32)
+    gaps = np.diff(order["time_ns"].to_numpy())[np.diff(index) == 0]
+    median_s = float(np.median(gaps)) * 1e-9 if len(gaps) else 0.0
+    return max(_TRUTH_GAP_STEPS * step_s, 2.0 * median_s)
+
+
+def _stored_grid(stored: MissionHypotheses, directory: Path) -> Grid:
+    drawn = [window for window in stored.windows if len(window.hypothesis)]
+    if not drawn:
+        raise InputError(f"{directory}: there are no hypotheses to score; see windows.parquet (status, advice) for the reasons")
+    origins_ns = np.array([window.origin_ns for window in stored.windows], dtype=np.int64)
+    first = drawn[0]
+    return Grid(first.step_ns, first.origin_index + 1, first.num_steps - first.origin_index - 1, origins_ns)
+
+
+def _default_sigma_m(directory: Path) -> float:
+    """The accuracy that infer gave to detections without covariance: rivals get the same."""
+    manifest = read_manifest("infer", directory) or {}
+    value = manifest.get("config", {}).get("default_sigma_m", 0.0)
+    return float(value) if isinstance(value, int | float) else 0.0
+
+
+def _named_like(truth: pa.Table, agent_ids: tuple[str, ...], directory: Path) -> pa.Table:
+    """The truth under the agents' names: detections of unknown origin belong to the only agent that there is."""
+    names = pc.unique(truth["agent_id"]).to_pylist()
+    if set(names) & set(agent_ids):
+        return truth
+    if agent_ids == (UNKNOWN_AGENT,) and len(names) == 1:
+        column = pa.array([UNKNOWN_AGENT] * truth.num_rows, pa.string())
+        return truth.set_column(truth.schema.get_field_index("agent_id"), truth.schema.field("agent_id"), column)
+    raise InputError(
+        f"{directory}: truth is of {', '.join(map(str, names[:5])) or 'nobody'}, detections are of {', '.join(agent_ids[:5])}; "
+        "give both the same names (agent, agent_path or {agent} in [[extract.truth]] and [[extract.detections]])"
+    )
+
+
+def _stored_hypotheses(stored: MissionHypotheses, windows: MissionWindows, index: Tensor, num_hypotheses: int) -> HypothesisSet:
+    """Hypotheses of some windows as one set; a window with fewer of them is filled up with weight zero."""
+    shape = (len(index), num_hypotheses, len(windows.agent_ids), windows.batch.num_steps, 2)
+    position = np.full(shape, np.nan)
+    weight = np.zeros(shape[:2])
+    for row, b in enumerate(index.tolist()):
+        window = stored.windows[b]
+        k = len(window.hypothesis)
+        weight[row, :k] = window.weight if k else 0.0
+        for agent in window.agents:
+            if agent.is_live and agent.agent_id in windows.agent_ids:
+                shift_m = np.array(agent.datum_m) - windows.datum_m[b]
+                target = position[row, :, windows.agent_ids.index(agent.agent_id)]
+                target[:k], target[k:] = agent.position_m + shift_m, agent.position_m[0] + shift_m
+    weight[weight.sum(axis=1) == 0] = 1.0  # nothing was drawn: all NaN, any weight does
+    weight /= weight.sum(axis=1, keepdims=True)
+    status = tuple(tuple("ok" for _ in windows.agent_ids) for _ in range(len(index)))
+    return HypothesisSet(torch.from_numpy(position), torch.from_numpy(weight), status)
+
+
+def _write_scores(missions: Sequence[ScoredMission], folder: Path, config: EvaluateConfig) -> dict[str, Any]:
+    """Write the three files into `folder`; returns the summary."""
+    report = pool(missions, config.num_resamples, config.seed)
+    write_atomic(folder / "scores.json", as_json(report))
+    write_atomic(folder / "scores.csv", as_csv(report))
+    write_atomic(folder / "scores.md", as_markdown(report))
+    return {"num_logs": len(missions), "grouped_by": report.grouped_by, "scores": headline(report)}
