@@ -205,13 +205,12 @@ def report(
 
 @app.command()
 def evaluate(
-    mission: Annotated[Path, typer.Argument(metavar="MISSION", help="Mission directory, or a folder of them.", show_default=False)],
-    config: Config = None, settings: Set = None, seed: Seed = None, force: Force = False, quiet: Quiet = False,
-    as_json: Json = False,
+    mission: Mission, config: Config = None, settings: Set = None, seed: Seed = None, force: Force = False,
+    quiet: Quiet = False, as_json: Json = False,
 ) -> None:  # fmt: skip
     """Score hypotheses against the truth of the log.
 
-    Beside the rivals: Kalman + RTS, the bank alone, interpolation, hold. A folder of missions gets one pooled table.
+    Beside the rivals: Kalman + RTS, the bank alone, interpolation, hold. A folder of mission directories gets a pooled table.
 
     \b
     Examples:

@@ -20,8 +20,10 @@ def to_json(value: Any) -> str:
 
 
 def stage_summary(result: StageResult) -> str:
-    """One line for the stage and one for each of its files."""
-    return "\n".join([f"{result.stage}: {result.status}", *(f"  {path}" for path in result.outputs)])
+    """What was done in one line, its counts and numbers in the next, then the files."""
+    numbers = [_named(name, value) for name, value in result.summary.items() if type(value) in (int, float) and value]
+    lines = [f"{result.stage}: {result.status}", *([f"  {', '.join(numbers)}"] if numbers else [])]
+    return "\n".join(lines + [f"  {path}" for path in result.outputs])
 
 
 def log_record(result: "LogResult") -> dict[str, Any]:
@@ -37,6 +39,10 @@ def log_summary(results: Sequence["LogResult"]) -> str:
         lines.append(f"{result.log}: {'ok' if result.error is None else 'failed'}")
         lines += [f"  {path}" for stage in result.stages if stage.stage in SHOWN_STAGES for path in stage.outputs]
     return "\n".join(lines)
+
+
+def _named(name: str, value: float) -> str:
+    return f"{name.removeprefix('num_').replace('_', ' ')} {round(value, 3) if isinstance(value, float) else value}"
 
 
 def _jsonable(value: Any) -> Any:

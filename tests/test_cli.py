@@ -114,7 +114,7 @@ def test_flags_reach_the_stage(fake_infer, tmp_path):
 def test_results_are_on_stdout_for_people_or_as_json(fake_infer, capsys):
     fake_infer()
     assert cli.main(["infer", "m"]) == 0
-    assert capsys.readouterr().out == "infer: done\n  m/hypotheses.parquet\n"
+    assert capsys.readouterr().out == "infer: done\n  windows 3\n  m/hypotheses.parquet\n"
     assert cli.main(["infer", "m", "--json"]) == 0
     assert json.loads(capsys.readouterr().out) == {
         "stage": "infer", "status": "done", "outputs": ["m/hypotheses.parquet"], "summary": {"num_windows": 3},
