@@ -16,6 +16,7 @@ from typing import BinaryIO
 from mcap.opcode import Opcode
 
 from cadence.errors import InputError
+from pipeline.logs.plan import Block, Loss, Plan
 from pipeline.logs.records import (
     MAGIC,
     MAX_TIME_NS,
@@ -27,7 +28,7 @@ from pipeline.logs.records import (
     unpack_cut_chunk,
     walk,
 )
-from pipeline.logs.salvage import Block, Loss, Plan, scan_log
+from pipeline.logs.salvage import scan_log
 
 _MAX_SENTENCES = 20
 _FOREIGN_MAGIC = {

@@ -26,6 +26,8 @@ MESSAGE_HEAD: Final = struct.Struct("<HIQQ")
 """Channel id, sequence, log time and publish time in front of the data of a message."""
 CHUNK_HEAD: Final = struct.Struct("<QQQII")
 """Start time, end time, uncompressed size, CRC and length of the name of the compression."""
+CHUNK_HEAD_BYTES: Final = 64
+"""Enough for `CHUNK_HEAD`, the name of the compression and the length of the data."""
 MAX_CHUNK_BYTES: Final = 2**30
 """Largest chunk that is decompressed; recorders write a few megabytes."""
 MAX_TIME_NS: Final = 2**63 - 1
@@ -124,16 +126,16 @@ def unpack_cut_chunk(body: bytes) -> tuple[records.Chunk, bytes]:
         compression = body[CHUNK_HEAD.size : CHUNK_HEAD.size + name_length].decode()
         data = body[CHUNK_HEAD.size + name_length + 8 :]
         if compression == "zstd":
-            data = zstandard.ZstdDecompressor().stream_reader(BytesIO(data)).read(MAX_CHUNK_BYTES)
+            data = zstandard.ZstdDecompressor().stream_reader(BytesIO(data)).read(min(size, MAX_CHUNK_BYTES))
         elif compression == "lz4":
-            data = lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=MAX_CHUNK_BYTES)
+            data = lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=min(size, MAX_CHUNK_BYTES))
         elif compression:
             raise DamagedRecord(f"it uses the compression {compression!r}, which is not known")
     return records.Chunk(compression, b"", end, start, crc, size), data
 
 
-def is_cut_chunk(head: bytes, length: int) -> bool:
-    """Whether `head`, the first bytes of a chunk's body, agrees that the body should be `length` bytes long."""
+def is_chunk_head(head: bytes, length: int) -> bool:
+    """Whether `head`, the first bytes of a chunk's body, agrees that the body is `length` bytes long."""
     if len(head) < CHUNK_HEAD.size:
         return False
     inner = CHUNK_HEAD.size + int(CHUNK_HEAD.unpack_from(head)[-1])

@@ -5,29 +5,30 @@ plan of what is left. Chunks are decompressed one at a time and their CRCs check
 """
 
 import bisect
-import re
 import struct
 import zlib
 from collections import Counter
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import BinaryIO, Final, Literal, TypeVar
+from typing import BinaryIO, Final, TypeVar
 
 from mcap import records
 from mcap.opcode import Opcode
 
+from pipeline.logs.plan import Block, LooseRun, Loss, Plan
 from pipeline.logs.records import (
     CHUNK_HEAD,
+    CHUNK_HEAD_BYTES,
     HEAD,
     MAGIC,
+    MAX_CHUNK_BYTES,
     MAX_TIME_NS,
     MESSAGE_HEAD,
     DamagedRecord,
     StrictStream,
     damage,
     index_count,
-    is_cut_chunk,
+    is_chunk_head,
     parse_channel,
     parse_chunk,
     parse_metadata,
@@ -36,76 +37,15 @@ from pipeline.logs.records import (
     unpack_cut_chunk,
     walk,
 )
-from pipeline.logs.summary import Summary, parse_summary_record, read_summary
+from pipeline.logs.resync import find_records
+from pipeline.logs.summary import parse_summary_record, read_summary
 
 LOOSE_BLOCK_BYTES: Final = 2**20
 """Messages outside chunks are planned in stretches of about this size."""
-_SEARCH_BYTES: Final = 2**20
-_MAX_SEARCH_BYTES: Final = 2**28
-_CHUNK_HEAD_BYTES: Final = 64
-_BELIEVED: Final = 3  # points that make a place believable after damage, see _Scanner._points
-_CANDIDATE: Final = re.compile(rb"[\x01-\x0f](?=[\x00-\xff]{5}\x00{3})")  # an opcode and a length below 2**40
+_READ_BYTES: Final = 2**20
 _Definition = TypeVar("_Definition", records.Channel, records.Schema)
+_MAX_BODY_BYTES: Final = MAX_CHUNK_BYTES + CHUNK_HEAD_BYTES
 _MAX_SMALL_BYTES: Final = 2**26  # channels, schemas, metadata, message indexes; larger ones are not believed
-
-_CHECKS: Final[Mapping[int, Callable[[bytes], object]]] = {
-    Opcode.CHANNEL: parse_channel,
-    Opcode.SCHEMA: parse_schema,
-    Opcode.METADATA: parse_metadata,
-    Opcode.MESSAGE_INDEX: index_count,
-}
-
-
-@dataclass(frozen=True)
-class Block:
-    """A stretch of the file which holds messages: the body of a chunk record, or records outside chunks.
-
-    offset, length  bytes in the file; for loose records they begin with a record head, for chunks with the chunk's fields
-    kind            a "cut" chunk is the last thing in a file that ends inside it
-    num_messages    by channel id
-    """
-
-    offset: int
-    length: int
-    kind: Literal["chunk", "cut", "loose"]
-    start_ns: int
-    end_ns: int
-    is_sorted: bool
-    num_messages: Mapping[int, int]
-
-
-@dataclass(frozen=True)
-class Loss:
-    """A part of the file that could not be used; `span_ns` and `num_messages` where they are known."""
-
-    offset: int
-    reason: str
-    span_ns: tuple[int, int] | None = None
-    num_messages: int | None = None
-
-
-@dataclass
-class Plan:
-    """What a log holds and what it has lost; filled by `scan_log`."""
-
-    blocks: list[Block] = field(default_factory=list)
-    channels: dict[int, records.Channel] = field(default_factory=dict)
-    schemas: dict[int, records.Schema] = field(default_factory=dict)
-    metadata_spans: list[tuple[int, int]] = field(default_factory=list)
-    losses: list[Loss] = field(default_factory=list)
-    remarks: list[str] = field(default_factory=list)
-    """Faults by which no message is lost."""
-    doubts: list[str] = field(default_factory=list)
-    """Faults by which messages may be lost or wrong, without a place in the file."""
-    summary: Summary | None = None
-    library: str = ""
-    reached_end: bool = False
-    has_checksums: bool = True
-
-    @property
-    def num_messages(self) -> int:
-        """Messages in the blocks, also those of channels without definition."""
-        return sum(sum(block.num_messages.values()) for block in self.blocks)
 
 
 def scan_log(path: Path, size: int, on_bytes: Callable[[int], object] | None = None) -> Plan:
@@ -127,11 +67,12 @@ class _Scanner:
         self.limit = self.plan.summary.data_end if self.plan.summary else size
         self.crc = 0
         self.position = self.reported = 0
-        self.loose = _LooseRun()
+        self.loose = LooseRun()
         self.previous = 0  # opcode of the record before: a message index follows a chunk or another one
         self.broken_chunk: int | None = None  # index of the loss of the chunk just before, to be counted by its indexes
         self.num_unknown = self.num_timeless = 0
-        self.seen: dict[bytes, None] = {}
+        self.definitions: set[bytes] = set()
+        self.chunks: set[int] = set()
 
     def run(self) -> None:
         """Fill the plan."""
@@ -180,17 +121,20 @@ class _Scanner:
         self.previous, self.position = opcode, end
 
     def _crc_of_rest(self, offset: int, length: int) -> None:
-        for begin in range(offset, offset + length, _SEARCH_BYTES):
-            self.crc = zlib.crc32(self._read(begin, min(_SEARCH_BYTES, offset + length - begin)), self.crc)
+        for begin in range(offset, offset + length, _READ_BYTES):
+            self.crc = zlib.crc32(self._read(begin, min(_READ_BYTES, offset + length - begin)), self.crc)
 
     def _take(self, opcode: int, offset: int, length: int) -> bytes | None:
         """Plan the record; its body where it was read."""
         if opcode in (Opcode.MESSAGE, Opcode.CHANNEL, Opcode.SCHEMA, Opcode.MESSAGE_INDEX, Opcode.METADATA, Opcode.HEADER):
-            if opcode != Opcode.MESSAGE and length > _MAX_SMALL_BYTES:
+            if length > (_MAX_BODY_BYTES if opcode == Opcode.MESSAGE else _MAX_SMALL_BYTES):
                 raise DamagedRecord("a record is impossibly long")
             return self._take_small(opcode, offset, self._read(offset, length))
         self._flush_loose()
         if opcode == Opcode.CHUNK:
+            if length > _MAX_BODY_BYTES:
+                self._skip_giant(offset, length)
+                return None
             body = self._read(offset, length)
             self._take_chunk(offset, body)
             return body
@@ -239,7 +183,8 @@ class _Scanner:
 
     def _take_chunk(self, offset: int, body: bytes) -> None:
         chunk = parse_chunk(body)
-        if not chunk.uncompressed_crc and body:
+        self.chunks.add(offset - HEAD.size)
+        if not chunk.uncompressed_crc:
             self.plan.has_checksums = False
         try:
             block = self._block_of_chunk(offset, len(body), unpack_chunk(chunk))
@@ -251,10 +196,20 @@ class _Scanner:
             if block.num_messages:
                 self.plan.blocks.append(block)
 
+    def _skip_giant(self, offset: int, length: int) -> None:
+        """Leave out a chunk too large to be read; raises where only its length is damaged."""
+        if not is_chunk_head(self._read(offset, CHUNK_HEAD_BYTES), length):
+            raise DamagedRecord("the length of a chunk is damaged")
+        span = self._header_span(offset - HEAD.size)
+        self.plan.losses.append(
+            Loss(offset - HEAD.size, f"the chunk is larger than the limit of {MAX_CHUNK_BYTES} bytes", span)
+        )
+        self.broken_chunk = len(self.plan.losses) - 1
+
     def _take_cut_chunk(self, offset: int, length: int) -> None:
         """Save the beginning of the chunk in which the file ends."""
-        body = self._read(offset, self.size - offset)
-        if not is_cut_chunk(body[:_CHUNK_HEAD_BYTES], length):
+        body = self._read(offset, min(self.size - offset, _MAX_BODY_BYTES))
+        if not is_chunk_head(body[:CHUNK_HEAD_BYTES], length):
             raise DamagedRecord("a chunk is longer than the file")
         chunk, data = unpack_cut_chunk(body)
         block = self._block_of_chunk(offset, len(body), data, is_cut=True)
@@ -291,9 +246,9 @@ class _Scanner:
     def _define(self, opcode: int, body: bytes) -> None:
         """Take a channel or schema; a second definition that differs is reported, the first stays."""
         key = bytes([opcode]) + body
-        if key in self.seen:
+        if key in self.definitions:
             return
-        self.seen[key] = None
+        self.definitions.add(key)
         if opcode == Opcode.CHANNEL:
             channel = parse_channel(body)
             if self.plan.channels.setdefault(channel.id, channel) != channel:
@@ -322,7 +277,7 @@ class _Scanner:
             raise DamagedRecord("an attachment is too short")
 
     def _flush_loose(self) -> None:
-        run, self.loose = self.loose, _LooseRun()
+        run, self.loose = self.loose, LooseRun()
         if run.begin >= 0:
             self.plan.blocks.append(run.block())
 
@@ -343,60 +298,11 @@ class _Scanner:
         if following < len(self.places):
             self.position = self.places[following]
         else:
-            self.position = self._find_records(offset + 1)
+            self.position = find_records(self.file, offset + 1, self.limit, self.plan.channels)
         where = f"bytes {offset} to {self.position}" if self.position < self.limit else f"everything from byte {offset} on"
         self.plan.losses.append(Loss(offset, f"{reason}; {where} skipped", span))
         self.previous = Opcode.CHUNK  # whatever lay there may have been a chunk with its indexes
         self.broken_chunk = len(self.plan.losses) - 1 if index else None
-
-    def _find_records(self, begin: int) -> int:
-        """The next place after `begin` where a chain of plausible records starts; the end of the data where there is none."""
-        stop = min(self.limit, begin + _MAX_SEARCH_BYTES)
-        for window in range(begin, stop, _SEARCH_BYTES):
-            self.file.seek(window)
-            data = self.file.read(_SEARCH_BYTES + HEAD.size - 1)
-            for match in _CANDIDATE.finditer(data):
-                _, length = HEAD.unpack_from(data, match.start())
-                offset = window + match.start()
-                if offset + HEAD.size + length <= self.limit and self._is_believable(offset):
-                    return offset
-        return self.limit
-
-    def _is_believable(self, offset: int) -> bool:
-        """Whether plausible records follow each other from `offset` on, enough of them or up to the end."""
-        points = 0
-        while points < _BELIEVED and offset < self.limit:
-            try:
-                head = self._read(offset, HEAD.size)
-                opcode, length = HEAD.unpack(head)
-                points += self._points(opcode, offset + HEAD.size, length)
-            except DamagedRecord:
-                return False
-            if opcode == Opcode.DATA_END:
-                return points > 1
-            offset += HEAD.size + length
-        return points >= _BELIEVED or offset == self.limit
-
-    def _points(self, opcode: int, offset: int, length: int) -> int:
-        """How much the record at `offset` speaks for real records: 2 where lengths inside agree with the outer one."""
-        if offset + length > self.limit:
-            raise DamagedRecord("too long")
-        if opcode == Opcode.MESSAGE and length >= MESSAGE_HEAD.size:
-            (channel_id,) = struct.unpack("<H", self._read(offset, 2))
-            if channel_id in self.plan.channels:
-                return 1
-        elif opcode == Opcode.CHUNK and length >= CHUNK_HEAD.size + 8:
-            name_length = CHUNK_HEAD.unpack(self._read(offset, CHUNK_HEAD.size))[-1]
-            if name_length + CHUNK_HEAD.size + 8 <= length:
-                (data_length,) = struct.unpack("<Q", self._read(offset + CHUNK_HEAD.size + name_length, 8))
-                if data_length == length - CHUNK_HEAD.size - name_length - 8:
-                    return 2
-        elif length <= _MAX_SMALL_BYTES and opcode in _CHECKS:
-            _CHECKS[opcode](self._read(offset, length))
-            return 2
-        elif opcode == Opcode.DATA_END and length == 4:
-            return 1
-        raise DamagedRecord("not a record")
 
     def _header_span(self, offset: int) -> tuple[int, int] | None:
         """The time span in the header of a chunk that is cut off."""
@@ -452,29 +358,3 @@ def _library(body: bytes) -> str:
             return str(records.Header.read(StrictStream(body)).library)
     except DamagedRecord:
         return ""
-
-
-@dataclass
-class _LooseRun:
-    """Consecutive records outside chunks, until they make a block."""
-
-    begin: int = -1
-    end: int = -1
-    first: int = 2**64
-    last: int = -1
-    previous: int = -1
-    is_sorted: bool = True
-    counts: Counter[int] = field(default_factory=Counter)
-
-    def add(self, begin: int, end: int, channel_id: int, log_time: int) -> None:
-        if self.begin < 0:
-            self.begin = begin
-        self.end = end
-        self.counts[channel_id] += 1
-        self.is_sorted = self.is_sorted and log_time >= self.previous
-        self.previous = log_time
-        self.first, self.last = min(self.first, log_time), max(self.last, log_time)
-
-    def block(self) -> Block:
-        """The block of the records so far."""
-        return Block(self.begin, self.end - self.begin, "loose", self.first, self.last, self.is_sorted, dict(self.counts))

@@ -1,0 +1,89 @@
+"""What a walk over a log has found: the stretches that hold messages, the definitions, and what is lost."""
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+from mcap import records
+
+from pipeline.logs.summary import Summary
+
+
+@dataclass(frozen=True)
+class Block:
+    """A stretch of the file which holds messages: the body of a chunk record, or records outside chunks.
+
+    offset, length  bytes in the file; for loose records they begin with a record head, for chunks with the chunk's fields
+    kind            a "cut" chunk is the last thing in a file that ends inside it
+    num_messages    by channel id
+    """
+
+    offset: int
+    length: int
+    kind: Literal["chunk", "cut", "loose"]
+    start_ns: int
+    end_ns: int
+    is_sorted: bool
+    num_messages: Mapping[int, int]
+
+
+@dataclass(frozen=True)
+class Loss:
+    """A part of the file that could not be used; `span_ns` and `num_messages` where they are known."""
+
+    offset: int
+    reason: str
+    span_ns: tuple[int, int] | None = None
+    num_messages: int | None = None
+
+
+@dataclass
+class Plan:
+    """What a log holds and what it has lost; filled by `scan_log`."""
+
+    blocks: list[Block] = field(default_factory=list)
+    channels: dict[int, records.Channel] = field(default_factory=dict)
+    schemas: dict[int, records.Schema] = field(default_factory=dict)
+    metadata_spans: list[tuple[int, int]] = field(default_factory=list)
+    losses: list[Loss] = field(default_factory=list)
+    remarks: list[str] = field(default_factory=list)
+    """Faults by which no message is lost."""
+    doubts: list[str] = field(default_factory=list)
+    """Faults by which messages may be lost or wrong, without a place in the file."""
+    summary: Summary | None = None
+    library: str = ""
+    reached_end: bool = False
+    has_checksums: bool = True
+
+    @property
+    def num_messages(self) -> int:
+        """Messages in the blocks, also those of channels without definition."""
+        return sum(sum(block.num_messages.values()) for block in self.blocks)
+
+
+@dataclass
+class LooseRun:
+    """Consecutive records outside chunks, until they make a block."""
+
+    begin: int = -1
+    end: int = -1
+    first: int = 2**64
+    last: int = -1
+    previous: int = -1
+    is_sorted: bool = True
+    counts: Counter[int] = field(default_factory=Counter)
+
+    def add(self, begin: int, end: int, channel_id: int, log_time: int) -> None:
+        """Take the message in the bytes [begin, end)."""
+        if self.begin < 0:
+            self.begin = begin
+        self.end = end
+        self.counts[channel_id] += 1
+        self.is_sorted = self.is_sorted and log_time >= self.previous
+        self.previous = log_time
+        self.first, self.last = min(self.first, log_time), max(self.last, log_time)
+
+    def block(self) -> Block:
+        """The block of the records so far."""
+        return Block(self.begin, self.end - self.begin, "loose", self.first, self.last, self.is_sorted, dict(self.counts))
