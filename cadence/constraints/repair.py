@@ -1,9 +1,34 @@
-"""The last step of inference: tracks that cross an obstacle are led around it, the detections stay where they are."""
+"""The last step of inference: tracks that cross an obstacle are led around it, the detections stay where they are.
 
+A track is cut at its pinned steps into legs. In each leg, the spans that collide are replaced by the shortest way
+around (`roadmap`), and their steps and some neighbours are laid along it in the old rhythm (`placement`). What cannot
+be led around with the margin that was asked for is tried again with smaller ones; the checker has the last word.
+"""
+
+import itertools
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import shapely
+import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
-from cadence.constraints.checker import segments_in_collision
+from cadence.constraints.checker import absolute_array, segments_in_collision, states_in_collision
 from cadence.constraints.obstacles import Obstacles
+from cadence.constraints.placement import arc_length, place
+from cadence.constraints.roadmap import Growth, Request, Zone
+
+FloatArray = NDArray[np.float64]
+
+_STRETCH = 1.15
+"""Steps may become this much longer before further neighbours share the detour."""
+_DETOUR = 1.5
+"""How much longer than the shortest a way on the side where most of the track already is may be."""
+_WIDEN_ROUNDS = 8
+_HOP_COST = 0.25
+"""What a corner costs, in mean steps: corners use up steps, so that few steps mean a coarser way round."""
 
 
 def repair(
@@ -14,6 +39,337 @@ def repair(
     *,
     offset_m: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Tracks [..., T, 2] moved out of the obstacles, and whether each [...] bool is now free of collisions."""
-    is_feasible = ~segments_in_collision(position_m, obstacles, offset_m=offset_m).any(dim=-1)
-    return position_m, is_feasible
+    """Tracks led around the obstacles, and whether they are now free of collisions.
+
+    position_m [..., T, 2] in metres, offset_m (broadcastable) is added to bring them into the obstacles' frame;
+    is_pinned [..., T] bool, steps that must stay exactly where they are. `margin_m` is kept from the obstacles where pinned
+    steps and gaps allow it. Steps that need not change are returned bit-identical; tracks with NaN are left alone.
+
+    Returns position_m and is_feasible [...]: True where no segment and no state collides (by `checker`). A pinned step inside
+    an obstacle, or two that are closer in time than any way around allows, make a track infeasible; the rest of it is repaired.
+    """
+    track = absolute_array(position_m, offset_m)
+    pinned = is_pinned.expand(position_m.shape[:-1]).reshape(track.shape[:2]).cpu().numpy()
+    repaired = track.copy()
+    if obstacles.count and track.size:
+        precision = float(position_m.detach().abs().nan_to_num(0.0, 0.0, 0.0).max()) * torch.finfo(position_m.dtype).eps
+        precision = max(precision, float(np.nanmax(np.abs(track), initial=0.0)) * 1e-14)
+        legs: list[_Leg] | None = None
+        for growth in (growths := _growths(obstacles, margin_m, 4 * precision)):
+            if legs is None or legs:
+                zone = Zone(obstacles, growth)
+                legs = _colliding_legs(track, pinned, zone) if legs is None else legs
+                legs = _repair_legs(track, repaired, pinned, legs, zone, growth is growths[-1])
+    changed = torch.from_numpy((repaired != track).any(axis=-1)).reshape(position_m.shape[:-1])
+    if not bool(changed.any()):
+        moved = position_m
+    else:
+        absolute = torch.from_numpy(repaired).reshape(position_m.shape).to(position_m.device)
+        relative = absolute if offset_m is None else absolute - offset_m.to(absolute)
+        moved = torch.where(changed.to(position_m.device)[..., None], relative.to(position_m.dtype), position_m)
+    collides = segments_in_collision(moved, obstacles, offset_m=offset_m).any(dim=-1)
+    return moved, ~(collides | states_in_collision(moved, obstacles, offset_m=offset_m).any(dim=-1))
+
+
+@dataclass(frozen=True)
+class _Leg:
+    """Steps low..high of one track; nothing between them is pinned, the ends may be."""
+
+    row: int
+    low: int
+    high: int
+
+
+@dataclass(frozen=True, eq=False)
+class _Span:
+    """Steps first..last of a leg whose way between collides. An open end lies in an obstacle and may move."""
+
+    first: int
+    last: int
+    parts: frozenset[int]
+    is_open_start: bool
+    is_open_end: bool
+    path: FloatArray | None = None
+    """The way round [P, 2], from the position of `first` (or where it was moved to) to that of `last`."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Case:
+    """A leg to repair: its positions [n, 2], which steps are bad [n], its region of free space, and the spans."""
+
+    leg: _Leg
+    point: FloatArray
+    is_bad: NDArray[np.bool_]
+    region: int
+    spans: tuple[_Span, ...]
+
+
+def _growths(obstacles: Obstacles, margin_m: float, precision_m: float) -> list[Growth]:
+    """From what was asked for to what just keeps clear: the second and third only see legs that the first cannot repair."""
+    boxes = shapely.bounds(obstacles.shapes)
+    size = float(np.median([*2 * obstacles.circle_array[:, 2], *np.hypot(*(boxes[:, 2:] - boxes[:, :2]).T)]))
+    least = max(precision_m, 1e-9 * size)
+    wide = max(0.02 * size, 0.25 * margin_m, 2 * least)
+    growths = [Growth(margin_m + least, wide)] if margin_m > least else []
+    return [*growths, Growth(least, wide), Growth(least, max(0.001 * size, 2 * least), core_sides=256, outline_sides=24)]
+
+
+def _colliding_legs(track: FloatArray, pinned: NDArray[np.bool_], zone: Zone) -> list[_Leg]:
+    """The legs of all tracks that touch the zone; tracks far from it, or with NaN, cost next to nothing."""
+    whole = np.flatnonzero(np.isfinite(track).all(axis=(1, 2)))
+    near = whole[zone.near(track[whole].min(axis=1), track[whole].max(axis=1))]
+    touches = (_hits(track[near], zone) >= 0).any(axis=1)
+    return [_Leg(row, low, high) for row in near[touches].tolist() for low, high in _cuts(pinned[row])]
+
+
+def _cuts(pinned: NDArray[np.bool_]) -> Iterator[tuple[int, int]]:
+    cuts = sorted({0, *np.flatnonzero(pinned).tolist(), len(pinned) - 1})
+    yield from itertools.pairwise(cuts if len(cuts) > 1 else [0, 0])
+
+
+def _hits(point: FloatArray, zone: Zone) -> NDArray[np.intp]:
+    """The component in the way of every segment [R, T-1] (-1: none) of tracks [R, T, 2]; a single step is its own segment."""
+    start, end = (point, point) if point.shape[1] == 1 else (point[:, :-1], point[:, 1:])
+    return zone.hits(start.reshape(-1, 2), end.reshape(-1, 2)).reshape(start.shape[:2])
+
+
+def _repair_legs(
+    track: FloatArray, repaired: FloatArray, pinned: NDArray[np.bool_], legs: list[_Leg], zone: Zone, is_last: bool
+) -> list[_Leg]:
+    """Repair what can be repaired against one zone, into `repaired`; returns the legs that could not."""
+    cases, failed = _diagnose(track, pinned, legs, zone, is_last)
+    cases, unrouted = _route(cases, zone)
+    for is_strict in (False, True):
+        placed = [(case, _place_case(case, is_strict)) for case in cases]
+        is_blocked = _blocked([point for _, point in placed], zone)
+        for (case, point), blocked in zip(placed, is_blocked, strict=True):
+            if not blocked:
+                repaired[case.leg.row, case.leg.low : case.leg.high + 1] = point
+        cases = [case for (case, _), blocked in zip(placed, is_blocked, strict=True) if blocked]
+    failed += [*unrouted, *cases]
+    if is_last:
+        for case in failed:
+            repaired[case.leg.row, case.leg.low : case.leg.high + 1] = _pushed_out(case, zone)
+    return [case.leg for case in failed]
+
+
+def _diagnose(
+    track: FloatArray, pinned: NDArray[np.bool_], legs: Sequence[_Leg], zone: Zone, is_last: bool
+) -> tuple[list[_Case], list[_Case]]:
+    """The legs that collide, as cases that have a chance, and as cases that have none against this zone."""
+    rows = np.unique([leg.row for leg in legs]).astype(np.intp)
+    points = track[rows]
+    region = zone.regions(points.reshape(-1, 2)).reshape(points.shape[:2])
+    part = _hits(points, zone)
+    cases, failed = [], []
+    for leg in legs:
+        row = int(np.searchsorted(rows, leg.row))
+        # A pinned step inside stays where it is: the rest of the leg is repaired as if it ended beside it.
+        ends = [pinned[leg.row, step] and region[row, step] < 0 for step in (leg.low, leg.high)]
+        if any(ends) and is_last:
+            leg = replace(leg, low=leg.low + int(ends[0]), high=leg.high - int(ends[1]))
+        if leg.low > leg.high:
+            continue
+        steps, segments = slice(leg.low, leg.high + 1), slice(leg.low, max(leg.high, leg.low + (part.shape[1] == 1)))
+        homes = {int(region[row, s]) for s in (leg.low, leg.high) if pinned[leg.row, s] and region[row, s] >= 0}
+        home = homes.pop() if homes else _most_frequent(region[row, steps])
+        is_bad = region[row, steps] != home
+        if homes or (any(ends) and not is_last):
+            failed.append(_Case(leg, points[row, steps], region[row, steps] < 0, home, ()))
+        elif spans := _spans(is_bad, part[row, segments], points[row, steps], zone):
+            cases.append(_Case(leg, points[row, steps], is_bad, home, spans))
+    return cases, failed
+
+
+def _most_frequent(region: NDArray[np.intp]) -> int:
+    free = region[region >= 0]
+    return int(np.bincount(free).argmax()) if len(free) else 0
+
+
+def _spans(is_bad: NDArray[np.bool_], part: NDArray[np.intp], point: FloatArray, zone: Zone) -> tuple[_Span, ...]:
+    """The runs of colliding segments; runs that are only parted by steps in a bay of the same component are one."""
+    if len(is_bad) == 1:
+        return (_span(0, 0, frozenset(part[part >= 0].tolist()), is_bad),) if is_bad[0] else ()
+    is_hit = (part >= 0) | is_bad[:-1] | is_bad[1:]
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], is_hit, [False]]).astype(np.int8)))
+    spans: list[_Span] = []
+    for first, last in edges.reshape(-1, 2).tolist():
+        parts = frozenset(part[first:last][part[first:last] >= 0].tolist())
+        before = spans[-1] if spans else None
+        if before is not None and any(zone.hull_holds(p, point[before.last : first + 1]) for p in parts & before.parts):
+            spans[-1] = _span(before.first, last, parts | before.parts, is_bad)
+        else:
+            spans.append(_span(first, last, parts, is_bad))
+    return tuple(spans)
+
+
+def _span(first: int, last: int, parts: frozenset[int], is_bad: NDArray[np.bool_]) -> _Span:
+    return _Span(first, last, parts, is_open_start=bool(is_bad[first]), is_open_end=bool(is_bad[last]))
+
+
+def _route(cases: list[_Case], zone: Zone) -> tuple[list[_Case], list[_Case]]:
+    """The cases with a path for every span, and those for which none was found even between the ends of the leg."""
+    routed, unrouted = [], []
+    for attempt in range(_WIDEN_ROUNDS):
+        wanted = [(case, span) for case in cases for span in case.spans if span.path is None]
+        paths = dict(zip(map(id, (span for _, span in wanted)), _paths(wanted, zone), strict=True))
+        again = []
+        for case in cases:
+            spans = tuple(replace(span, path=paths.get(id(span), span.path)) for span in case.spans)
+            case = replace(case, spans=spans)
+            if all(span.path is not None for span in spans):
+                routed.append(case)
+            elif (wider := _widened(case, 2**attempt)) is None:
+                unrouted.append(case)
+            else:
+                again.append(wider)
+        if not (cases := again):
+            break
+    return routed, unrouted + cases
+
+
+def _widened(case: _Case, steps: int) -> _Case | None:
+    """The case with more steps for its spans without path, overlapping spans merged; None where there are no more."""
+    end = len(case.point) - 1
+    if any(span.path is None and (span.first, span.last) == (0, end) for span in case.spans):
+        return None
+    spans: list[_Span] = []
+    for span in case.spans:
+        if span.path is None:
+            span = _span(max(0, span.first - steps), min(end, span.last + steps), span.parts, case.is_bad)
+        while spans and spans[-1].last > span.first:
+            before = spans.pop()
+            first, last = min(before.first, span.first), max(before.last, span.last)
+            span = _span(first, last, before.parts | span.parts, case.is_bad)
+        spans.append(span)
+    return replace(case, spans=tuple(spans))
+
+
+def _paths(wanted: Sequence[tuple[_Case, _Span]], zone: Zone) -> list[FloatArray | None]:
+    """The way round for each span, [P, 2] from start to end, or None."""
+    paths: list[FloatArray | None] = [None] * len(wanted)
+    requests = {}
+    for index, (case, span) in enumerate(wanted):
+        if (request := _request(case, span, zone)) is not None:
+            requests[index] = request
+    ways = dict(zip(requests, zone.routes(list(requests.values())), strict=True))
+    for index, way in ways.items():
+        if way is not None:
+            paths[index] = np.concatenate([requests[index].start[None], way, requests[index].end[None]])
+    others = {}
+    for index, path in enumerate(paths):
+        if path is not None and (barrier := _barrier(*wanted[index], path, zone)) is not None:
+            others[index] = replace(requests[index], barrier=barrier)
+    for (index, request), way in zip(others.items(), zone.routes(list(others.values())), strict=True):
+        path = paths[index]
+        if way is not None and path is not None:
+            other = np.concatenate([request.start[None], way, request.end[None]])
+            if arc_length(other)[-1] <= _DETOUR * arc_length(path)[-1]:
+                paths[index] = other
+    return paths
+
+
+def _request(case: _Case, span: _Span, zone: Zone) -> Request | None:
+    start, end = case.point[span.first], case.point[span.last]
+    for is_open in (span.is_open_start, span.is_open_end):
+        if is_open:
+            exits = zone.exits(np.stack([start, end]), case.region)
+            if exits is None or bool((zone.regions(exits) != case.region)[[span.is_open_start, span.is_open_end]].any()):
+                return None
+            start = exits[0] if span.is_open_start else start
+            end = exits[1] if span.is_open_end else end
+            break
+    if span.first == span.last:
+        return Request(start, start, 0, 0.0, tuple(sorted(span.parts)))
+    step = arc_length(case.point[span.first : span.last + 1])[-1] / (span.last - span.first)
+    return Request(start, end, span.last - span.first - 1, _HOP_COST * step, tuple(sorted(span.parts)))
+
+
+def _barrier(case: _Case, span: _Span, path: FloatArray, zone: Zone) -> FloatArray | None:
+    """A ray across the side of `path`, where most of the colliding steps are nearer to the other side; else None."""
+    inside = case.point[span.first + 1 : span.last][case.is_bad[span.first + 1 : span.last]]
+    chord = path[-1] - path[0]
+    chord_length = float(np.hypot(*chord))
+    if span.is_open_start or span.is_open_end or not len(inside) or len(path) < 3 or chord_length == 0:
+        return None
+    exits = zone.exits(inside, case.region)
+    if exits is None:
+        return None
+    left = np.array([-chord[1], chord[0]]) / chord_length
+    vote = int(np.sign((exits - inside) @ left).sum())
+    side = float(np.sign(((path[1:-1] - path[0]) @ left).mean()))
+    if vote * side >= 0:
+        return None
+    reach = 4 * (max(zone.size(part) for part in span.parts) + chord_length)
+    middle = inside[len(inside) // 2]
+    return np.stack([middle, middle + side * reach * left])
+
+
+def _place_case(case: _Case, is_strict: bool) -> FloatArray | None:
+    """The positions [n, 2] of the leg with every span laid along its path; `is_strict` keeps to the spans' own steps."""
+    point = case.point.copy()
+    for index, span in enumerate(case.spans):
+        floor = 0 if index == 0 else (case.spans[index - 1].last + span.first) // 2
+        ceiling = len(point) - 1 if index + 1 == len(case.spans) else (span.last + case.spans[index + 1].first) // 2
+        is_open = span.is_open_start or span.is_open_end
+        low, high = (span.first, span.last) if is_strict or is_open else _share(case.point, span, floor, ceiling)
+        new = _lay(case.point[low : high + 1], span, span.first - low, high - span.last)
+        if new is None:
+            return None
+        point[low : high + 1] = new
+    return point
+
+
+def _share(point: FloatArray, span: _Span, floor: int, ceiling: int) -> tuple[int, int]:
+    """The fewest steps around a span, low..high, that share its detour so that none becomes much longer than it was."""
+    assert span.path is not None
+    walked, detour = arc_length(point), arc_length(span.path)[-1]
+    low, high = span.first, span.last
+    while low > floor or high < ceiling:
+        old = walked[high] - walked[low]
+        if old + detour - (walked[span.last] - walked[span.first]) <= _STRETCH * old:
+            break
+        grow = 1 + (high - low) // 8
+        low, high = max(floor, low - grow), min(ceiling, high + grow)
+    return low, high
+
+
+def _lay(old: FloatArray, span: _Span, before: int, after: int) -> FloatArray | None:
+    """Steps old [n, 2] laid along the path of the span, with `before` and `after` further steps of the old way at its ends."""
+    assert span.path is not None
+    path = np.concatenate([old[:before], span.path, old[len(old) - after :]])
+    if len(old) == 1:
+        return path[:1]
+    # Towards an open end a track walks on as far as it would have, from an open start it comes likewise.
+    is_reversed = span.is_open_start and not span.is_open_end
+    if is_reversed:
+        old, path, before, after = old[::-1], path[::-1], after, before
+    walked = arc_length(path)
+    is_open = span.is_open_start or span.is_open_end
+    length = min(walked[-1], arc_length(old)[-1]) if is_open else walked[-1]
+    new = place(old, path, walked[before + 1 : len(walked) - after - 1], float(length))
+    if new is None:
+        return None
+    if not (span.is_open_start and span.is_open_end):
+        new[0] = old[0]
+    if not is_open:
+        new[-1] = old[-1]
+    return new[::-1] if is_reversed else new
+
+
+def _blocked(points: Sequence[FloatArray | None], zone: Zone) -> list[bool]:
+    """Which tracks [n, 2] touch the zone; those that are None do."""
+    found = [point for point in points if point is not None]
+    if not found:
+        return [True] * len(points)
+    start = np.concatenate([point[:-1] if len(point) > 1 else point for point in found])
+    end = np.concatenate([point[1:] if len(point) > 1 else point for point in found])
+    owner = np.repeat(np.arange(len(found)), [max(len(point) - 1, 1) for point in found])
+    touches = iter(np.bincount(owner, zone.hits(start, end) >= 0, len(found)) > 0)
+    return [True if point is None else bool(next(touches)) for point in points]
+
+
+def _pushed_out(case: _Case, zone: Zone) -> FloatArray:
+    """The leg with every colliding step at the nearest free point: the most that can be done without a way round."""
+    exits = zone.exits(case.point, case.region)
+    return case.point if exits is None else np.where(case.is_bad[:, None], exits, case.point)

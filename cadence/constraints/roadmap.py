@@ -1,0 +1,336 @@
+"""Ways around obstacles: the grown obstacles as a zone, and shortest routes along its corners (a visibility graph).
+
+Everything is planned against two growths of the obstacles: routes must not touch the `core` (obstacles plus margin), and
+their waypoints are corners of the `outline` (a little larger), so that rounding never decides whether a route is free.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from cadence.constraints.obstacles import Obstacles
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.intp]
+
+_MAX_CORNERS = 96
+"""Corners of one component that take part in a search; larger outlines are simplified, outwards."""
+_MAX_HOPS = 24
+_CHUNK = 20_000_000
+
+
+@dataclass(frozen=True)
+class Growth:
+    """How far the core and the outline lie from the obstacles, and how finely circles are drawn."""
+
+    margin_m: float
+    clearance_m: float
+    core_sides: int = 64
+    outline_sides: int = 12
+
+
+@dataclass(frozen=True, eq=False)
+class Request:
+    """One route to find: from start to end [2] with at most max_waypoints corners; every corner costs hop_cost_m extra.
+
+    parts are the components in the way; barrier, when given, is a segment [2, 2] that the route must not cross.
+    """
+
+    start: FloatArray
+    end: FloatArray
+    max_waypoints: int
+    hop_cost_m: float
+    parts: tuple[int, ...]
+    barrier: FloatArray | None = None
+
+
+class Zone:
+    """The grown obstacles: which points and segments are free, where the nearest free point is, which way leads around."""
+
+    def __init__(self, obstacles: Obstacles, growth: Growth) -> None:
+        self.growth = growth
+        outer = growth.margin_m + growth.clearance_m
+        self.core = _Index(_parts(_grow_round(obstacles, growth.margin_m, growth.core_sides)))
+        # The corners of round cores stick out by 1 / cos: the outline has to stay clear of them.
+        stretch = 2 / np.cos(np.pi / growth.core_sides) - 1
+        self.outline = _Index(_parts(_grow_sharp(obstacles, outer, growth.outline_sides, stretch)))
+        holes = [shapely.Polygon(ring) for part in self.core.shapes for ring in part.interiors]
+        # Largest first, so that the innermost of nested holes names the region.
+        self.holes = _Index(np.array(sorted(holes, key=lambda hole: -hole.area), dtype=object))
+        self._bends: dict[int, FloatArray] = {}
+        self._between: dict[tuple[int, int], FloatArray] = {}
+        self._graphs: dict[tuple[int, ...], _Graph] = {}
+
+    def near(self, low: FloatArray, high: FloatArray) -> IntArray:
+        """Indices of the boxes from low to high [N, 2] that meet the box of a component."""
+        boxes = shapely.box(low[:, 0], low[:, 1], high[:, 0], high[:, 1])
+        return np.unique(self.core.tree.query(boxes)[0])
+
+    def size(self, part: int) -> float:
+        """Diagonal in metres of the box of a component of the outline."""
+        west, south, east, north = shapely.bounds(self.outline.shapes[part])
+        return float(np.hypot(east - west, north - south))
+
+    def hits(self, start: FloatArray, end: FloatArray) -> IntArray:
+        """For segments from start to end [N, 2], a component of the outline in the way [N]; -1 where the core is clear."""
+        found = np.full(len(start), -1)
+        segment, part = self.core.touching(shapely.linestrings(np.stack([start, end], axis=1)))
+        found[segment] = self._outline_of_core[part]
+        return found
+
+    def regions(self, point: FloatArray) -> IntArray:
+        """The region of free space of points [N, 2]: 0 outside everything, 1 + hole inside a hole, -1 in the core."""
+        points = shapely.points(point)
+        region = np.zeros(len(point), dtype=np.intp)
+        index, hole = self.holes.touching(points)
+        order = np.argsort(hole, kind="stable")
+        region[index[order]] = 1 + hole[order]
+        region[self.core.touching(points)[0]] = -1
+        return region
+
+    def exits(self, point: FloatArray, region: int) -> FloatArray | None:
+        """The points on the outline [N, 2] nearest to `point` [N, 2] in a region of free space; None where it has no border."""
+        border = self._borders.get(region)
+        if border is None:
+            return None
+        lines = shapely.shortest_line(border, shapely.points(point))
+        nearest: FloatArray = shapely.get_coordinates(lines).reshape(-1, 2, 2)[:, 0]
+        return nearest
+
+    def hull_holds(self, part: int, point: FloatArray) -> bool:
+        """Whether all points [N, 2] lie in the convex hull of a component of the outline."""
+        return bool(shapely.intersects_xy(self._hulls[part], point[:, 0], point[:, 1]).all())
+
+    def routes(self, requests: Sequence[Request]) -> list[FloatArray | None]:
+        """The shortest route of each request as its waypoints [m, 2] (start and end left out); None where there is none."""
+        found: list[FloatArray | None] = [None] * len(requests)
+        for widen in (False, True):
+            groups: dict[tuple[int, ...], list[int]] = {}
+            for index, request in enumerate(requests):
+                if found[index] is None:
+                    groups.setdefault(self._neighbourhood(request.parts, widen), []).append(index)
+            for parts, members in groups.items():
+                graph = self._graph(parts)
+                for index, route in zip(members, graph.search(self, [requests[m] for m in members]), strict=True):
+                    found[index] = route
+        return found
+
+    def _graph(self, parts: tuple[int, ...]) -> "_Graph":
+        if parts not in self._graphs:
+            corners = np.concatenate([np.zeros((0, 2)), *(self._corners(part) for part in parts)])
+            blocks = [[self._lengths(a, b) for b in parts] for a in parts]
+            self._graphs[parts] = _Graph(corners, np.block(blocks) if parts else np.zeros((0, 0)))
+        return self._graphs[parts]
+
+    def _corners(self, part: int) -> FloatArray:
+        if part not in self._bends:
+            bends = _bends(self.outline.shapes[part], self.growth.clearance_m)
+            self._bends[part] = bends[self.regions(bends) >= 0]
+        return self._bends[part]
+
+    def _lengths(self, a: int, b: int) -> FloatArray:
+        """Lengths of the free segments between the corners of two components; each pair is looked at once."""
+        if a > b:
+            return self._lengths(b, a).T
+        if (a, b) not in self._between:
+            start, end = self._corners(a), self._corners(b)
+            shape = (len(start), len(end), 2)
+            lengths = _free_lengths(self, np.broadcast_to(start[:, None], shape), np.broadcast_to(end, shape))
+            self._between[a, b] = lengths
+        return self._between[a, b]
+
+    def _neighbourhood(self, parts: tuple[int, ...], widen: bool) -> tuple[int, ...]:
+        """The components in the way and those near them; with `widen` also those that are far."""
+        near = set(parts)
+        for part in parts:
+            west, south, east, north = shapely.bounds(self.outline.shapes[part])
+            reach = (2.0 if widen else 0.25) * self.size(part)
+            near.update(self.outline.tree.query(shapely.box(west - reach, south - reach, east + reach, north + reach)).tolist())
+        return tuple(sorted(near))
+
+    @cached_property
+    def _outline_of_core(self) -> IntArray:
+        inner = shapely.point_on_surface(self.core.shapes)
+        owner = np.zeros(len(inner), dtype=np.intp)
+        index, part = self.outline.touching(inner)
+        owner[index] = part
+        return owner
+
+    @cached_property
+    def _hulls(self) -> NDArray[np.object_]:
+        hulls: NDArray[np.object_] = shapely.convex_hull(self.outline.shapes)
+        shapely.prepare(hulls)
+        return hulls
+
+    @cached_property
+    def _borders(self) -> dict[int, Any]:
+        rings = [ring for part in self.outline.shapes for ring in (part.exterior, *part.interiors)]
+        if not rings:
+            return {}
+        region = self.regions(np.array([ring.coords[0] for ring in rings]))
+        borders = {}
+        for name in np.unique(region[region >= 0]).tolist():
+            borders[name] = shapely.MultiLineString([ring for ring, its in zip(rings, region, strict=True) if its == name])
+            shapely.prepare(borders[name])
+        return borders
+
+
+class _Index:
+    """Prepared shapes with a search tree."""
+
+    def __init__(self, shapes: NDArray[np.object_]) -> None:
+        self.shapes = shapes
+        shapely.prepare(shapes)
+        self.tree = shapely.STRtree(shapes)
+
+    def touching(self, geometry: NDArray[np.object_]) -> tuple[IntArray, IntArray]:
+        """All pairs (index into geometry, index into shapes) that touch."""
+        query, shape = self.tree.query(geometry)
+        # Element by element with the prepared shape first: the tree's own predicate would prepare the many small queries.
+        touch = shapely.intersects(self.shapes[shape], geometry[query])
+        return query[touch], shape[touch]
+
+
+@dataclass(frozen=True, eq=False)
+class _Graph:
+    """Corners that routes may bend at [V, 2] and the lengths [V, V] of the free segments between them, else infinite."""
+
+    corners: FloatArray
+    length: FloatArray
+
+    def search(self, zone: Zone, requests: Sequence[Request]) -> list[FloatArray | None]:
+        """The shortest route of every request."""
+        start, end = np.stack([r.start for r in requests]), np.stack([r.end for r in requests])
+        shape = (len(requests), len(self.corners), 2)
+        corners = np.broadcast_to(self.corners, shape)
+        ends = [_free_lengths(zone, np.broadcast_to(p[:, None], shape), corners) for p in (start, end)]
+        direct = _free_lengths(zone, start, end)
+        routes: list[FloatArray | None] = [None] * len(requests)
+        free = [index for index, request in enumerate(requests) if request.barrier is None]
+        rows = max(1, _CHUNK // max(1, len(self.corners) ** 2))
+        for first in range(0, len(free), rows):
+            some = free[first : first + rows]
+            found = self._shortest([requests[i] for i in some], direct[some], ends[0][some], ends[1][some], self.length)
+            for index, route in zip(some, found, strict=True):
+                routes[index] = route
+        for index, request in enumerate(requests):
+            if request.barrier is not None:
+                bar = request.barrier
+                one = [
+                    np.where(_crosses(request.start[None], request.end[None], bar), np.inf, direct[index]),
+                    np.where(_crosses(request.start, self.corners, bar), np.inf, ends[0][index])[None],
+                    np.where(_crosses(request.end, self.corners, bar), np.inf, ends[1][index])[None],
+                    np.where(_crosses(self.corners[:, None], self.corners, bar), np.inf, self.length),
+                ]
+                routes[index] = self._shortest([request], *one)[0]
+        return routes
+
+    def _shortest(
+        self, requests: Sequence[Request], best: FloatArray, first: FloatArray, last: FloatArray, between: FloatArray
+    ) -> list[FloatArray | None]:
+        """Shortest paths by dynamic programming over the number of corners: best [R] holds the straight ways."""
+        hop = np.array([r.hop_cost_m for r in requests])[:, None]
+        allowed = np.array([r.max_waypoints for r in requests])
+        row = np.arange(len(requests))
+        hops, corner = np.zeros_like(allowed), np.zeros_like(allowed)
+        reach, came_from = first + hop, []
+        for level in range(1, min(int(allowed.max()), _MAX_HOPS) + 1):
+            if not reach.size or bool((reach.min(axis=1) >= best).all()):
+                break
+            total = np.where(allowed[:, None] >= level, reach + last, np.inf)
+            candidate = total.argmin(axis=1)
+            is_better = total[row, candidate] < best
+            best = np.where(is_better, total[row, candidate], best)
+            hops, corner = np.where(is_better, level, hops), np.where(is_better, candidate, corner)
+            through = reach[:, :, None] + between
+            came_from.append(through.argmin(axis=1))
+            reach = through.min(axis=1) + hop
+        routes: list[FloatArray | None] = []
+        for index in row:
+            chain = [int(corner[index])] if hops[index] else []
+            for level in range(int(hops[index]) - 2, -1, -1):
+                chain.append(int(came_from[level][index, chain[-1]]))
+            routes.append(self.corners[chain[::-1]].reshape(-1, 2) if np.isfinite(best[index]) else None)
+        return routes
+
+
+def _free_lengths(zone: Zone, start: FloatArray, end: FloatArray) -> FloatArray:
+    """Lengths [...] of the segments from start to end [..., 2]; infinite where the core is in the way."""
+    delta = end - start
+    length: FloatArray = np.hypot(delta[..., 0], delta[..., 1])
+    blocked = zone.hits(start.reshape(-1, 2), end.reshape(-1, 2)).reshape(length.shape) >= 0
+    return np.where(blocked, np.inf, length)
+
+
+def _crosses(start: FloatArray, end: FloatArray, barrier: FloatArray) -> NDArray[np.bool_]:
+    """Whether segments [..., 2] properly cross the barrier [2, 2]."""
+    base, tip = barrier
+    sides = _cross(tip - base, start - base) * _cross(tip - base, end - base)
+    ends = _cross(end - start, base - start) * _cross(end - start, tip - start)
+    crosses: NDArray[np.bool_] = (sides < 0) & (ends < 0)
+    return crosses
+
+
+def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
+    product: FloatArray = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+    return product
+
+
+def _bends(part: Any, clearance_m: float) -> FloatArray:
+    """Corners of a component that a shortest route can bend at, and a few farther out for tracks with few steps."""
+    shape, tolerance = part, clearance_m
+    corners = _convex_corners(shape)
+    while len(corners) > _MAX_CORNERS and tolerance < 1e6 * clearance_m:
+        # A line simplified by less than it was moved out still lies outside of where it came from.
+        shape = part.buffer(tolerance, join_style="mitre", mitre_limit=2.5).simplify(0.9 * tolerance)
+        corners, tolerance = _convex_corners(shape), 2 * tolerance
+    rectangle = shapely.minimum_rotated_rectangle(part)
+    around = shapely.get_coordinates(rectangle.buffer(clearance_m, join_style="mitre"))[:-1]
+    angle = np.arange(6) * (np.pi / 3)
+    ring = shapely.minimum_bounding_radius(part) * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    centre = shapely.get_coordinates(shapely.centroid(rectangle))
+    return np.concatenate([corners, around, centre + 2.0 * ring])
+
+
+def _convex_corners(shape: Any) -> FloatArray:
+    found = [np.zeros((0, 2))]
+    for part in _parts(shape):
+        for ring in (part.exterior, *part.interiors):
+            corner = shapely.get_coordinates(ring)[:-1]
+            turn = _cross(corner - np.roll(corner, 1, axis=0), np.roll(corner, -1, axis=0) - corner)
+            found.append(corner[turn > 0])
+    return np.concatenate(found)
+
+
+def _parts(shape: Any) -> NDArray[np.object_]:
+    """The polygons of a geometry, interiors to the left of every ring."""
+    polygons = [part for part in shapely.get_parts(shape) if part.geom_type == "Polygon" and not part.is_empty]
+    parts = np.empty(len(polygons), dtype=object)
+    parts[:] = [shapely.geometry.polygon.orient(part) for part in polygons]
+    return parts
+
+
+def _grow_round(obstacles: Obstacles, distance_m: float, sides: int) -> Any:
+    """The union of everything nearer than distance_m to an obstacle, at most a trace larger, never smaller."""
+    apothem = np.cos(np.pi / sides)
+    return shapely.union_all(
+        [*_discs(obstacles, distance_m, sides), *shapely.buffer(obstacles.shapes, distance_m / apothem, quad_segs=sides // 4)]
+    )
+
+
+def _grow_sharp(obstacles: Obstacles, distance_m: float, sides: int, stretch: float) -> Any:
+    """The same with few corners, sharp where the obstacles have corners; circles are `stretch` times as large."""
+    grown = shapely.buffer(obstacles.shapes, distance_m, join_style="mitre", mitre_limit=2.5)
+    return shapely.union_all([*_discs(obstacles, distance_m, sides, stretch), *grown])
+
+
+def _discs(obstacles: Obstacles, distance_m: float, sides: int, stretch: float = 1.0) -> list[Any]:
+    """Polygons around the circles, grown by distance_m."""
+    angle = np.arange(sides) * (2 * np.pi / sides)
+    unit = np.stack([np.cos(angle), np.sin(angle)], axis=1) / np.cos(np.pi / sides)
+    return [shapely.Polygon(row[:2] + stretch * (row[2] + distance_m) * unit) for row in obstacles.circle_array]
