@@ -24,6 +24,7 @@ from pipeline.positions import ChannelReader, Positions, Rows, read_positions
 from pipeline.progress import Progress
 from pipeline.selection import ROLES, select_readers
 from pipeline.sources import SourceConfig
+from pipeline.spikes import is_spike
 from pipeline.tables import Frame, write_table
 from pipeline.thinning import ThinningConfig, is_seen, noise
 from schemas.tables import DETECTIONS, POSES, TRUTH
@@ -40,6 +41,7 @@ class ExtractConfig:
     simultaneity_s   detections of one agent within this time are collapsed into one
     start_s, end_s   use only this part of the mission, in seconds after the log's first message
     default_sigma_m  standard deviation of detections that state none; without it they count as exact
+    max_speed_mps    single positions that could only be reached and left again faster are recorder faults (see `spikes`)
     datum            [latitude, longitude] in degrees of x = y = 0; by default the median of all positions, and unknown for
                      logs in metres
     """
@@ -53,6 +55,7 @@ class ExtractConfig:
     start_s: float | None = None
     end_s: float | None = None
     default_sigma_m: float | None = None
+    max_speed_mps: float | None = 1000.0
     datum: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
@@ -60,6 +63,8 @@ class ExtractConfig:
             raise ValueError("simultaneity_s must not be negative")
         if self.default_sigma_m is not None and not 0 < self.default_sigma_m < np.inf:
             raise ValueError("default_sigma_m must be positive")
+        if self.max_speed_mps is not None and not self.max_speed_mps > 0:
+            raise ValueError("max_speed_mps must be positive")
         if self.start_s is not None and self.end_s is not None and not self.start_s < self.end_s:
             raise ValueError("start_s must be smaller than end_s")
         if self.datum is not None and not (abs(self.datum[0]) <= 90 and abs(self.datum[1]) <= 180):
@@ -86,7 +91,7 @@ def write_tables(log: MissionLog, folder: Path, config: ExtractConfig, progress:
     _check_any(log, primary, rows[primary], counts, config)
     frame = mission_frame(rows[primary], [rows[role] for role in ROLES if role != primary], config.datum)
     for role in ROLES:
-        rows[role] = _placed(role, rows[role], frame, counts)
+        rows[role] = _without_spikes(_placed(role, rows[role], frame, counts), config.max_speed_mps, counts)
     if config.thinning.enabled:
         rows["detections"] = _thinned(rows[primary], config.thinning)
         if len(rows["detections"]) == 0:
@@ -161,6 +166,14 @@ def _placed(role: str, rows: Positions, frame: Frame, counts: Counter[str]) -> P
     return placed
 
 
+def _without_spikes(rows: Positions, max_speed_mps: float | None, counts: Counter[str]) -> Positions:
+    if max_speed_mps is None:
+        return rows
+    spikes = is_spike(rows, max_speed_mps)
+    counts["spikes"] += int(spikes.sum())
+    return rows[~spikes]
+
+
 def _thinned(rows: Positions, config: ThinningConfig) -> Positions:
     """The rows that fall into bursts, with noise."""
     if any(agent is None for agent in rows.agent):
@@ -230,6 +243,7 @@ def _tell(counts: Counter[str], detections: Positions, log: MissionLog, progress
         "no_fix": "positions are marked as having no fix and were skipped",
         "bad_covariance": "covariances are not positive definite and were replaced by the default",
         "out_of_order": "time stamps were out of order and were sorted",
+        "spikes": "positions lie far off their track (see extract.max_speed_mps) and were skipped",
         "other_frame": "positions are in another frame than the detections and were skipped",
     }
     for name, meaning in meanings.items():
@@ -260,7 +274,7 @@ def _summary(
         "span_s": span_s,
         "frame": {"frame_id": frame.frame_id, "latitude_deg": frame.latitude_deg, "longitude_deg": frame.longitude_deg},
         "sources": {role: sorted({r.source.topic for r in readers if r.role == role}) for role in ROLES},
-        **{name: counts[name] for name in (*names, "other_frame", "collapsed", "duplicate_truth")},
+        **{name: counts[name] for name in (*names, "other_frame", "spikes", "collapsed", "duplicate_truth")},
         "lost_spans_ns": [list(span) for span in log.health.lost_spans_ns],
         "is_complete": log.health.is_complete,
     }

@@ -107,7 +107,7 @@ class MessagePath:
         return any(isinstance(step, Slice | Filter) for step in self.steps)
 
     def values(self, message: Any) -> list[Any]:
-        """What the path finds in a decoded message (attributes or mappings); `MissingFieldError` where it leads nowhere."""
+        """What the path finds in a decoded message (attributes or dicts); `MissingFieldError` where it leads nowhere."""
         items = [message]
         for step in self.steps:
             items = step.apply(items)
@@ -172,7 +172,7 @@ def _literal(text: str) -> str | float | bool:
 
 def _field(item: Any, name: str) -> Any:
     try:
-        return item[name] if isinstance(item, Mapping) else getattr(item, name)
+        return item[name] if isinstance(item, dict) else getattr(item, name)
     except (KeyError, AttributeError) as error:
         known = field_names(item)
         hint = f"; fields there: {', '.join(known)}" if known else ""
@@ -181,7 +181,7 @@ def _field(item: Any, name: str) -> Any:
 
 def field_names(item: Any) -> list[str]:
     """The names of the fields of a decoded message, for advice; empty where they cannot be listed."""
-    if isinstance(item, Mapping):
+    if isinstance(item, dict):
         return [str(name) for name in item]
     descriptor = getattr(item, "DESCRIPTOR", None)
     if descriptor is not None:

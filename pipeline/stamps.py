@@ -2,7 +2,6 @@
 
 import math
 import re
-from collections.abc import Mapping
 from datetime import UTC, datetime
 from typing import Any
 
@@ -15,7 +14,7 @@ _LIMIT_NS = 2**63
 def stamp_ns(value: Any) -> int | None:
     """Nanoseconds since the epoch of a stamp; None where it is unset (zero, absent) or cannot be understood.
 
-    Understood are ROS 1, ROS 2 and protobuf times (objects or mappings of seconds and nanoseconds), ISO 8601 text (UTC where it
+    Understood are ROS 1, ROS 2 and protobuf times (objects or dicts of seconds and nanoseconds), ISO 8601 text (UTC where it
     states no zone) and plain numbers: seconds, milliseconds, microseconds or nanoseconds since 1970, told apart by size.
     """
     if isinstance(value, str):
@@ -39,7 +38,7 @@ def _pair_ns(value: Any) -> int | None:
 
 def _first(value: Any, names: tuple[str, ...]) -> Any:
     for name in names:
-        found = value.get(name) if isinstance(value, Mapping) else getattr(value, name, None)
+        found = value.get(name) if isinstance(value, dict) else getattr(value, name, None)
         if found is not None:
             return found
     return None
