@@ -23,6 +23,8 @@ from pipeline.provenance import versions
 from pipeline.tables import Frame
 
 STAGE = "simulate"
+VERSION = 1
+"""Raised when the same settings make other logs than before: finished episodes are then written anew."""
 
 
 @dataclass(frozen=True)
@@ -131,7 +133,7 @@ def _key(config: SimulateConfig, index: int) -> str:
     """What an episode's bytes depend on, as a hash."""
     settled = config_as_dict(replace(config, num_episodes=1, first_index=index))
     made_by = {name: versions()[name] for name in ("cadence", "numpy", "mcap")}
-    text = json.dumps({"config": settled, "versions": made_by}, sort_keys=True)
+    text = json.dumps({"config": settled, "version": VERSION, "made_by": made_by}, sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()
 
 

@@ -100,22 +100,22 @@ class RouteField:
 def smooth_path(path_m: Array, clearance: Clearance, keep_out_m: float, sigma_cells: float = 3.0) -> Array:
     """A path [P, 2] of evenly spaced points without the corners of the grid, its ends kept.
 
-    Points are averaged along the path; where that would come nearer than `keep_out_m` to an obstacle (raster distance),
-    the average is taken over half as many points, down to the path as it was.
+    Points are averaged along the path. Around places where that would come nearer than `keep_out_m` to an obstacle (raster
+    distance) the path fades into what it was; where even that does not help, it is returned as it was.
     """
     if len(path_m) < 3:
         return path_m
-    smoothed = path_m.copy()
-    is_done = np.zeros(len(path_m), dtype=bool)
-    weight_to_end = np.minimum(np.arange(len(path_m)), np.arange(len(path_m))[::-1])[:, None]
-    for sigma in (sigma_cells, sigma_cells / 2, sigma_cells / 4):
-        average = ndimage.gaussian_filter1d(path_m, sigma, axis=0, mode="nearest")
-        blend = np.minimum(weight_to_end / (2 * sigma), 1.0)
-        average = blend * average + (1 - blend) * path_m
-        accept = ~is_done & (clearance.at_points(average) >= keep_out_m)
-        smoothed[accept] = average[accept]
-        is_done |= accept
-    return smoothed
+    average = ndimage.gaussian_filter1d(path_m, sigma_cells, axis=0, mode="nearest")
+    to_end = np.minimum(np.arange(len(path_m)), np.arange(len(path_m))[::-1])
+    share = np.minimum(to_end / (3 * sigma_cells), 1.0)
+    for reach in (4, 8, 16):
+        smoothed: Array = path_m + share[:, None] * (average - path_m)
+        is_near = clearance.at_points(smoothed) < keep_out_m
+        if not is_near.any():
+            return smoothed
+        around = ndimage.binary_dilation(is_near, iterations=reach)
+        share = np.minimum(share, 1.0 - ndimage.gaussian_filter1d(around.astype(np.float64), reach / 3.0))
+    return path_m
 
 
 @dataclass(frozen=True)

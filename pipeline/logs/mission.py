@@ -1,4 +1,10 @@
-"""A simulated episode as a mission log: truth, sensors, detections, obstacles to look at and obstacles to compute with."""
+"""A simulated episode as a mission log: truth, sensors, detections, obstacles to look at and obstacles to compute with.
+
+Topics: /truth/AGENT and /sensors/SENSOR/pose (positions), /detections (messages that name agent and sensor) or
+/detections/AGENT (messages that have no field for the agent), /scene/obstacles (foxglove.SceneUpdate, protobuf always).
+Metadata records: `mission` (JSON values: how the log came about), `cadence.obstacles` (key `obstacles`: the list of
+obstacles.json, in the mission frame, whose datum stands beside it).
+"""
 
 import json
 from collections.abc import Mapping
@@ -118,12 +124,7 @@ def _write_messages(writer: Writer, episode: Episode, form: MissionForm) -> None
             (xx, xy), (_, yy) = np.round(seen.covariance_m2[row], 3).tolist()
             x, y = measured[row].tolist()
             report = Report(time_ns, frame_id, x, y, (xx, xy, yy), agent_id, sensor_id)
-            topics.write(_detection_topic(detections, agent_id, sensor_id), detections, report)
-
-
-def _detection_topic(form: Form, agent_id: str, sensor_id: str) -> str:
-    """One topic a sensor; where messages have no field for the agent, one topic an agent and sensor."""
-    return f"/detections/{sensor_id}" if form.has_agent_id else f"/detections/{agent_id}/{sensor_id}"
+            topics.write("/detections" if detections.has_agent_id else f"/detections/{agent_id}", detections, report)
 
 
 def _place(position_m: np.ndarray[Any, np.dtype[np.float64]], form: MissionForm) -> np.ndarray[Any, np.dtype[np.float64]]:
