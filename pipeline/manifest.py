@@ -125,6 +125,7 @@ def _still_valid(stage: str, directory: Path, earlier: JsonObject, key: JsonObje
 
 @contextlib.contextmanager
 def _working_folder(stage: str, directory: Path) -> Iterator[Path]:
+    is_new = not directory.exists()
     try:
         directory.mkdir(parents=True, exist_ok=True)
         work = Path(tempfile.mkdtemp(prefix=f".{stage}.", dir=directory))
@@ -136,3 +137,6 @@ def _working_folder(stage: str, directory: Path) -> Iterator[Path]:
         raise DeviceError(f"{directory}: {stage} could not write its output ({error}); check the free space") from error
     finally:
         shutil.rmtree(work, ignore_errors=True)
+        if is_new:
+            with contextlib.suppress(OSError):  # the folder stays where it holds something
+                directory.rmdir()

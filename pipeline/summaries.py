@@ -33,10 +33,11 @@ def log_record(result: "LogResult") -> dict[str, Any]:
 
 
 def log_summary(results: Sequence["LogResult"]) -> str:
-    """One line for each log, and below it the files to look at."""
+    """One line for each log, and below it what was lost of a damaged one, and the files to look at."""
     lines = []
     for result in results:
         lines.append(f"{result.log}: {'ok' if result.error is None else 'failed'}")
+        lines += [f"  damaged: {problem}" for stage in result.stages for problem in stage.summary.get("problems", ())]
         lines += [f"  {path}" for stage in result.stages if stage.stage in SHOWN_STAGES for path in stage.outputs]
     return "\n".join(lines)
 
