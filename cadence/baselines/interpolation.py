@@ -112,7 +112,8 @@ def _draw(windows: WindowBatch, num_hypotheses: int) -> _Draws:
     num_before = torch.searchsorted(time_s.contiguous(), steps.expand(*time_s.shape[:2], -1).contiguous(), right=True)
     last = (detections.count - 1).clamp_min(0)[..., None]
     noise, detection_noise = _noise(windows, num_hypotheses)
-    factor = torch.linalg.cholesky(detections.covariance_m2.double())
+    # Exact detections have no covariance: a micrometre leaves them exact and the factor defined.
+    factor = torch.linalg.cholesky(detections.covariance_m2.double() + 1e-12 * torch.eye(2, dtype=torch.float64))
     point_m = detections.position_m.double()[:, None] + torch.einsum("bansu,bkanu->bkans", factor, detection_noise)
     return _Draws(
         time_s=steps,

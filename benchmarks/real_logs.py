@@ -1,0 +1,389 @@
+"""Which estimator reconstructs and predicts real tracks best from few detections?
+
+Real flight, ship and aircraft tracks (../shared/data) are thinned to bursts of detections, several times with different seeds;
+every estimator is fitted to the detections alone and scored on the same windows against the whole track. One JSON file per
+log, rate, seed and estimator in the work folder: a killed run goes on where it was, and one estimator can be done again alone
+(--again NAME). Tables go to stdout; --publish DIR writes real_logs.md and real_logs.png there.
+"""
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+
+import numpy as np
+
+from cadence.errors import CadenceError
+from cadence.metrics import Interval, bootstrap_ratio
+from cadence.types import Detections, Estimator
+from pipeline.evaluate import RIVALS, default_truth_gap_s
+from pipeline.extract import ExtractConfig, extract
+from pipeline.ingest import IngestConfig, ingest
+from pipeline.manifest import write_atomic
+from pipeline.progress import Progress
+from pipeline.scores import METRICS, PARTS, Cells, compare, groups_of
+from pipeline.sources import SourceConfig
+from pipeline.tables import read_table
+from pipeline.thinning import ThinningConfig
+from pipeline.windows import GridConfig, MissionWindows, build_windows, fit_tracks, plan_grid, truth_on_grid
+
+DATA = Path(__file__).resolve().parents[1].parent / "shared" / "data"
+WORK = Path("out/benchmarks/real_logs")
+RATES = (0.05, 0.12, 0.30)
+KALMANS = ("cv", "ou")
+SHOWN = ("past", "between", "future")
+RESULT_VERSION = 1
+
+
+@dataclass(frozen=True)
+class Case:
+    """A log, its dense channel, and the mean length of a burst of detections."""
+
+    path: str
+    truth: SourceConfig
+    mean_burst_s: float
+
+
+CASES = {
+    "flight": Case("flights/cubs2_cub_stabilize.mcap", SourceConfig("/cub1/pose", agent="cub1"), 1.0),
+    "ships": Case("maritime/solent_ais_known.mcap", SourceConfig("/truth/{agent}"), 20.0),
+    "aircraft": Case("flights/calfire_adsb_known.mcap", SourceConfig("/truth/{agent}"), 60.0),
+}
+
+ESTIMATORS: Mapping[str, Callable[[Detections, float], Estimator]] = dict(RIVALS)
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One thinned log."""
+
+    log: str
+    rate: float
+    seed: int
+
+    @property
+    def folder(self) -> str:
+        """Where its files lie in the work folder."""
+        return f"{self.log}/rate{100 * self.rate:02.0f}_seed{self.seed}"
+
+
+@dataclass(frozen=True)
+class Result:
+    """One estimator on one thinned log: sums and counts of every metric by group and part.
+
+    sums, counts  {part: {metric: [a number a group]}} in the order of `groups`
+    """
+
+    version: int
+    estimator: str
+    log: str
+    rate: float
+    seed: int
+    num_hypotheses: int
+    step_s: float
+    num_windows: int
+    num_detections: int
+    max_truth_gap_s: float
+    fit_s: float
+    score_s: float
+    groups: list[str]
+    sums: dict[str, dict[str, list[float]]]
+    counts: dict[str, dict[str, list[int]]]
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run what is missing, print the table, and publish it where asked to."""
+    options = _parser().parse_args(arguments)
+    if not DATA.is_dir():
+        print(f"skipped: {DATA} is not here")
+        return 0
+    progress = Progress(quiet=options.quiet)
+    settings = [Setting(log, rate, seed) for log in options.logs for rate in options.rates for seed in options.seeds]
+    for setting in settings:
+        run_setting(setting, options.estimators, options.again, options.hypotheses, options.work, progress)
+    results = [_load(options.work, s, name, options.hypotheses) for s in settings for name in options.estimators]
+    found = [result for result in results if result is not None]
+    rows = table(found)
+    print(as_text(rows))
+    if options.publish is not None:
+        options.publish.mkdir(parents=True, exist_ok=True)
+        command = " ".join(["python benchmarks/real_logs.py", *(arguments if arguments is not None else sys.argv[1:])])
+        write_atomic(options.publish / "real_logs.md", as_markdown(rows, found, command))
+        draw_chart(rows, options.publish / "real_logs.png")
+    return 0
+
+
+def run_setting(
+    setting: Setting, names: Sequence[str], again: Sequence[str], num_hypotheses: int, work: Path, progress: Progress
+) -> None:
+    """Score the estimators that have no result yet for one thinned log."""
+    missing = [name for name in names if name in again or _load(work, setting, name, num_hypotheses) is None]
+    if not missing:
+        return
+    directory = work / setting.folder
+    prepare(setting, directory, progress)
+    detections, _ = read_table(directory / "detections.parquet", "detections")
+    truth, _ = read_table(directory / "truth.parquet", "truth")
+    grid = plan_grid(detections, GridConfig())
+    windows = build_windows(detections, grid, setting.seed)
+    max_gap_s = default_truth_gap_s(truth, grid.step_s)
+    truth_m, is_known = truth_on_grid(truth, windows, max_gap_s)
+    tracks = fit_tracks(detections, grid)
+    for name in missing:
+        begin = time.perf_counter()
+        estimator = ESTIMATORS[name](tracks, grid.step_s)
+        fitted = time.perf_counter()
+        with progress.bar(windows.batch.num_windows, f"{setting.folder} {name}", "window") as bar:
+            cells = compare({name: estimator}, windows.batch, truth_m, is_known, num_hypotheses, None, bar.update)[name]
+        groups, sums, counts = _grouped(cells, windows)
+        result = Result(
+            RESULT_VERSION, name, setting.log, setting.rate, setting.seed, num_hypotheses, grid.step_s,
+            windows.batch.num_windows, detections.num_rows, max_gap_s, fitted - begin, time.perf_counter() - fitted, groups,
+            sums, counts,
+        )  # fmt: skip
+        write_atomic(_path(work, setting, name, num_hypotheses), json.dumps(asdict(result)))
+
+
+def prepare(setting: Setting, directory: Path, progress: Progress) -> None:
+    """Ingest the log and thin its dense channel into detections; skipped where it is done."""
+    case = CASES[setting.log]
+    gap_s = case.mean_burst_s * (1.0 - setting.rate) / setting.rate
+    thinning = ThinningConfig(enabled=True, seed=setting.seed, mean_gap_s=gap_s, mean_burst_s=case.mean_burst_s)
+    quiet = Progress(quiet=True)
+    ingest(DATA / case.path, directory, IngestConfig(), quiet)
+    extract(directory, ExtractConfig(truth=(case.truth,), suggest=False, thinning=thinning), quiet)
+    progress.note(f"{setting.folder}: thinned, bursts of {case.mean_burst_s:g} s, gaps of {gap_s:.4g} s")
+
+
+@dataclass(frozen=True)
+class Row:
+    """One estimator on one log at one rate, over all seeds. `ratio` is to the better Kalman smoother by energy score."""
+
+    log: str
+    rate: float
+    part: str
+    estimator: str
+    means: dict[str, Interval]
+    num_cells: int
+    ratio: Interval | None
+    better: str | None
+
+
+def table(results: Sequence[Result]) -> list[Row]:
+    """Rows over all seeds of a log and rate; only seeds that every estimator has done are used."""
+    rows = []
+    for log, rate in dict.fromkeys((result.log, result.rate) for result in results):
+        here = [result for result in results if (result.log, result.rate) == (log, rate)]
+        names = list(dict.fromkeys(result.estimator for result in here))
+        seeds = set.intersection(*({r.seed for r in here if r.estimator == name} for name in names))
+        for part in SHOWN:
+            pooled = {name: _pooled([r for r in here if r.estimator == name and r.seed in seeds], part) for name in names}
+            rows += [_row(log, rate, part, name, pooled) for name in names]
+    return rows
+
+
+Pooled = Mapping[str, Mapping[str, tuple[float, int]]]
+"""{metric: {group: (sum, count)}} over seeds."""
+
+
+def _pooled(results: Sequence[Result], part: str) -> Pooled:
+    pooled: dict[str, dict[str, tuple[float, int]]] = {metric: {} for metric in METRICS}
+    for result in results:
+        for metric in METRICS:
+            for group, total, count in zip(result.groups, result.sums[part][metric], result.counts[part][metric], strict=True):
+                earlier = pooled[metric].get(group, (0.0, 0))
+                pooled[metric][group] = (earlier[0] + total, earlier[1] + count)
+    return pooled
+
+
+def _row(log: str, rate: float, part: str, name: str, pooled: Mapping[str, Pooled]) -> Row:
+    rng = np.random.default_rng(0)
+    means = {}
+    for metric, groups in pooled[name].items():
+        total, count = (np.array(side, float) for side in zip(*groups.values(), strict=True))
+        means[metric] = bootstrap_ratio(total, count, list(groups), rng)
+    own = pooled[name]["energy_score_m"]
+    num_cells = sum(count for _, count in own.values())
+    kalmans = [kalman for kalman in KALMANS if kalman in pooled]
+    if not kalmans:
+        return Row(log, rate, part, name, means, num_cells, None, None)
+    rivals = {kalman: pooled[kalman]["energy_score_m"] for kalman in kalmans}
+    for kalman, groups in rivals.items():
+        if {group: count for group, (_, count) in groups.items()} != {group: count for group, (_, count) in own.items()}:
+            raise CadenceError(
+                f"{log} {rate:g}: {name} and {kalman} were scored on different cells; run --again {name} {kalman}"
+            )
+    better = min(rivals, key=lambda kalman: sum(total for total, _ in rivals[kalman].values()))
+    top = [total for total, _ in own.values()]
+    bottom = [rivals[better][group][0] for group in own]
+    return Row(log, rate, part, name, means, num_cells, bootstrap_ratio(top, bottom, list(own), rng), better)
+
+
+def as_text(rows: Sequence[Row]) -> str:
+    """A compact table for the terminal."""
+    head = f"{'log':9}{'rate':>5} {'part':8}{'estimator':11}{'energy':>9}{'ratio':>7}  {'interval':15}{'ADE':>8}{'minADE':>8}"
+    lines = [head + f"{'mean':>8}{'in50':>6}{'in90':>6}{'traj.':>8}"]
+    for row in rows:
+        ratio = f"{'–':>7}  {'':15}"
+        if row.ratio is not None:
+            ratio = f"{row.ratio.value:7.3f}  {f'[{row.ratio.low:.3f}, {row.ratio.high:.3f}]':15}"
+        value = {metric: interval.value for metric, interval in row.means.items()}
+        lines.append(
+            f"{row.log:9}{100 * row.rate:4.0f}% {row.part:8}{row.estimator:11}{value['energy_score_m']:9.3f}{ratio}"
+            f"{value['ade_m']:8.2f}{value['min_ade_m']:8.2f}{value['mean_error_m']:8.2f}"
+            f"{value['coverage_50']:6.2f}{value['coverage_90']:6.2f}{value['trajectory_energy_score_m']:8.2f}"
+        )
+    return "\n".join(lines)
+
+
+def as_markdown(rows: Sequence[Row], results: Sequence[Result], command: str) -> str:
+    """The page for docs/benchmarks."""
+    seeds = sorted({result.seed for result in results})
+    lines = [
+        "# Real tracks from few detections", "",
+        "A small aircraft in a motion-capture volume (one flight of 198 s), 37 ships (AIS) and 33 fire-fighting aircraft",
+        "(ADS-B), thinned to random bursts of detections, at 5, 12 and 30 % of the samples. Every estimator is fitted to",
+        f"the detections alone, draws {results[0].num_hypotheses} joint samples a window, and is scored on the same windows",
+        "against the whole track.", "",
+        "* past: steps up to the origin, after the first detection of the window; between: those of them with a later",
+        "  detection in the window too; future: steps beyond the origin.",
+        "* energy: energy score (plain form) a step, metres, lower is better; ratio: to the better of the two Kalman",
+        "  smoothers (cv, ou) by the same score, with a paired 95 % bootstrap interval over agents (flight: over ten blocks",
+        "  of time), all seeds of an agent together.",
+        "* in 50, in 90: share of truth within the region of 50 and 90 % highest density (right: 0.50 and 0.90).",
+        "* trajectory: energy score of a whole track, root mean square over its steps.", "",
+        f"Thinning seeds {', '.join(map(str, seeds))}; mean burst 1 s (flight), 20 s (ships), 60 s (aircraft), mean gap",
+        "burst × (1 − rate) / rate.",
+        "", "    " + command, "", "![Energy score over that of the better Kalman smoother](real_logs.png)", "",
+    ]  # fmt: skip
+    for log in dict.fromkeys(row.log for row in rows):
+        lines += _log_section(log, [row for row in rows if row.log == log], [r for r in results if r.log == log])
+    return "\n".join(lines).rstrip() + "\n"
+
+
+def _log_section(log: str, rows: Sequence[Row], results: Sequence[Result]) -> list[str]:
+    lines = [f"## {log.capitalize()}", ""]
+    for rate in dict.fromkeys(row.rate for row in rows):
+        here = [result for result in results if result.rate == rate]
+        steps = sorted({result.step_s for result in here})
+        windows = sorted({result.num_windows for result in here})
+        lines += [
+            f"### {100 * rate:.0f} % detections", "",
+            f"Step {_span(steps)} s, {_span(windows)} windows a seed.", "",
+            "| part | estimator | energy m | ratio | ADE m | minADE m | mean's error | in 50 | in 90 | trajectory m | cells |",
+            "| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |",
+        ]  # fmt: skip
+        for row in rows:
+            if row.rate == rate:
+                lines.append(_markdown_row(row))
+        lines.append("")
+    return lines
+
+
+def _markdown_row(row: Row) -> str:
+    means = row.means
+    energy = means["energy_score_m"]
+    ratio = "–"
+    if row.ratio is not None:
+        ratio = f"{row.ratio.value:.3f} [{row.ratio.low:.3f}, {row.ratio.high:.3f}]"
+        ratio += f" ({row.better})" if row.estimator != row.better else " (itself)"
+    cells = [
+        row.part, row.estimator, f"{energy.value:.3g} [{energy.low:.3g}, {energy.high:.3g}]", ratio,
+        *(f"{means[name].value:.3g}" for name in ("ade_m", "min_ade_m", "mean_error_m")),
+        *(f"{means[name].value:.2f}" for name in ("coverage_50", "coverage_90")),
+        f"{means['trajectory_energy_score_m'].value:.3g}", str(row.num_cells),
+    ]  # fmt: skip
+    return "| " + " | ".join(cells) + " |"
+
+
+def _span(values: Sequence[float]) -> str:
+    return f"{values[0]:g}" if len(values) == 1 else f"{values[0]:g} to {values[-1]:g}"
+
+
+def draw_chart(rows: Sequence[Row], path: Path) -> None:
+    """Ratios to the better Kalman smoother: a panel a log and part, a group a rate, a mark an estimator."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    logs, names = list(dict.fromkeys(r.log for r in rows)), list(dict.fromkeys(r.estimator for r in rows))
+    figure, axes = plt.subplots(len(logs), len(SHOWN), figsize=(12, 2.8 * len(logs)), squeeze=False, layout="constrained")
+    for axis_row, log in zip(axes, logs, strict=True):
+        for axis, part in zip(axis_row, SHOWN, strict=True):
+            here = [row for row in rows if row.log == log and row.part == part and row.ratio is not None]
+            rates = list(dict.fromkeys(row.rate for row in here))
+            for index, name in enumerate(names):
+                ratios = [(rates.index(row.rate), row.ratio) for row in here if row.estimator == name and row.ratio]
+                x = [place + 0.8 * ((index + 0.5) / len(names) - 0.5) for place, _ in ratios]
+                y = np.array([ratio.value for _, ratio in ratios])
+                reach = np.array([[ratio.value - ratio.low, ratio.high - ratio.value] for _, ratio in ratios]).T.reshape(2, -1)
+                axis.errorbar(x, y, np.maximum(reach, 0.0), fmt="o", color=f"C{index}", label=name, capsize=2)
+            axis.axhline(1.0, color="0.6", linewidth=1)
+            axis.set_yscale("log")
+            ticks = [0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 5.0]
+            axis.set_yticks(ticks, [f"{tick:g}" for tick in ticks])
+            axis.minorticks_off()
+            axis.set_xticks(range(len(rates)), [f"{100 * rate:.0f} %" for rate in rates])
+            axis.set_title(f"{log}, {part}", fontsize=10)
+    axes[0, 0].legend(fontsize=8)
+    figure.supylabel("energy score over that of the better Kalman smoother")
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+def _grouped(
+    cells: Cells, windows: MissionWindows
+) -> tuple[list[str], dict[str, dict[str, list[float]]], dict[str, dict[str, list[int]]]]:
+    """Names of the bootstrap groups, and sums and counts of every metric by part and group."""
+    codes, index = np.unique(groups_of(cells, windows.batch.num_windows), return_inverse=True)
+    first = np.array([np.flatnonzero(index == group)[0] for group in range(len(codes))], dtype=np.int64)
+    agents = [windows.agent_ids[cells.agent[cell]] for cell in first]
+    is_by_agent = len(set(agents)) == len(agents)
+    names = agents if is_by_agent else [f"{agent}/{code % 10}" for agent, code in zip(agents, codes, strict=True)]
+    sums: dict[str, dict[str, list[float]]] = {}
+    counts: dict[str, dict[str, list[int]]] = {}
+    for part in PARTS:
+        is_in = cells.is_in(part)
+        sums[part], counts[part] = {}, {}
+        for metric in METRICS:
+            value = cells.column(metric)
+            valid = is_in & ~np.isnan(value)
+            sums[part][metric] = np.bincount(index[valid], value[valid], len(codes)).tolist()
+            counts[part][metric] = np.bincount(index[valid], minlength=len(codes)).tolist()
+    return names, sums, counts
+
+
+def _path(work: Path, setting: Setting, name: str, num_hypotheses: int) -> Path:
+    return work / setting.folder / f"{name}_k{num_hypotheses}.json"
+
+
+def _load(work: Path, setting: Setting, name: str, num_hypotheses: int) -> Result | None:
+    """An earlier result; None where there is none, or one of another version."""
+    try:
+        record = json.loads(_path(work, setting, name, num_hypotheses).read_text(encoding="utf-8"))
+        is_known = set(record) == {field.name for field in fields(Result)} and record["version"] == RESULT_VERSION
+    except (OSError, ValueError, TypeError):
+        return None
+    return Result(**record) if is_known else None
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--work", type=Path, default=WORK, help="results so far (default %(default)s)")
+    parser.add_argument("--logs", nargs="+", choices=CASES, default=list(CASES))
+    parser.add_argument("--rates", nargs="+", type=float, default=list(RATES))
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
+    parser.add_argument("--estimators", nargs="+", choices=ESTIMATORS, default=list(ESTIMATORS))
+    parser.add_argument("--again", nargs="+", choices=ESTIMATORS, default=[], help="do these again though they have results")
+    parser.add_argument("--hypotheses", type=int, default=50, help="joint samples a window (default %(default)s)")
+    parser.add_argument("--publish", type=Path, help="write real_logs.md and real_logs.png into this folder")
+    parser.add_argument("--quiet", action="store_true")
+    return parser
+
+
+if __name__ == "__main__":
+    sys.exit(main())
