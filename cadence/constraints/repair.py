@@ -18,7 +18,7 @@ from torch import Tensor
 from cadence.constraints.checker import absolute_array, segments_in_collision, states_in_collision
 from cadence.constraints.obstacles import Obstacles
 from cadence.constraints.placement import arc_length, place
-from cadence.constraints.roadmap import Growth, Request, Zone
+from cadence.constraints.roadmap import MAX_CORNERS, Growth, Request, Zone
 
 FloatArray = NDArray[np.float64]
 
@@ -82,7 +82,7 @@ class _Leg:
 
 @dataclass(frozen=True, eq=False)
 class _Span:
-    """Steps first..last of a leg whose way between collides. An open end lies in an obstacle and may move."""
+    """Steps first..last of a leg whose way between collides. An open end is that of the leg, and may move."""
 
     first: int
     last: int
@@ -95,11 +95,12 @@ class _Span:
 
 @dataclass(frozen=True, eq=False)
 class _Case:
-    """A leg to repair: its positions [n, 2], which steps are bad [n], its region of free space, and the spans."""
+    """A leg to repair: its positions [n, 2], which steps are bad [n], which of its ends are pinned, its region, its spans."""
 
     leg: _Leg
     point: FloatArray
     is_bad: NDArray[np.bool_]
+    is_pinned: tuple[bool, bool]
     region: int
     spans: tuple[_Span, ...]
 
@@ -171,13 +172,14 @@ def _diagnose(
         if leg.low > leg.high:
             continue
         steps, segments = slice(leg.low, leg.high + 1), slice(leg.low, max(leg.high, leg.low + (part.shape[1] == 1)))
-        homes = {int(region[row, s]) for s in (leg.low, leg.high) if pinned[leg.row, s] and region[row, s] >= 0}
-        home = homes.pop() if homes else _most_frequent(region[row, steps])
-        is_bad = region[row, steps] != home
+        is_pinned = (bool(pinned[leg.row, leg.low]), bool(pinned[leg.row, leg.high]))
+        point, its_region = points[row, steps], region[row, steps]
+        homes = {int(its_region[end]) for end in (0, -1) if is_pinned[end] and its_region[end] >= 0}
+        home = homes.pop() if homes else _most_frequent(its_region)
         if homes or (any(ends) and not is_last):
-            failed.append(_Case(leg, points[row, steps], region[row, steps] < 0, home, ()))
-        elif spans := _spans(is_bad, part[row, segments], points[row, steps], zone):
-            cases.append(_Case(leg, points[row, steps], is_bad, home, spans))
+            failed.append(_Case(leg, point, its_region < 0, is_pinned, home, ()))
+        elif spans := _spans(its_region != home, part[row, segments], point, zone):
+            cases.append(_Case(leg, point, its_region != home, is_pinned, home, spans))
     return cases, failed
 
 
@@ -232,7 +234,10 @@ def _widened(case: _Case, steps: int) -> _Case | None:
     """The case with more steps for its spans without path, overlapping spans merged; None where there are no more."""
     end = len(case.point) - 1
     if any(span.path is None and (span.first, span.last) == (0, end) for span in case.spans):
-        return None
+        span = case.spans[0]
+        opened = replace(span, is_open_start=not case.is_pinned[0], is_open_end=not case.is_pinned[1])
+        is_news = (opened.is_open_start, opened.is_open_end) != (span.is_open_start, span.is_open_end)
+        return replace(case, spans=(opened,)) if is_news else None
     spans: list[_Span] = []
     for span in case.spans:
         if span.path is None:
@@ -270,19 +275,18 @@ def _paths(wanted: Sequence[tuple[_Case, _Span]], zone: Zone) -> list[FloatArray
 
 
 def _request(case: _Case, span: _Span, zone: Zone) -> Request | None:
-    start, end = case.point[span.first], case.point[span.last]
-    for is_open in (span.is_open_start, span.is_open_end):
-        if is_open:
-            exits = zone.exits(np.stack([start, end]), case.region)
-            if exits is None or bool((zone.regions(exits) != case.region)[[span.is_open_start, span.is_open_end]].any()):
-                return None
-            start = exits[0] if span.is_open_start else start
-            end = exits[1] if span.is_open_end else end
-            break
-    if span.first == span.last:
-        return Request(start, start, 0, 0.0, tuple(sorted(span.parts)))
-    step = arc_length(case.point[span.first : span.last + 1])[-1] / (span.last - span.first)
-    return Request(start, end, span.last - span.first - 1, _HOP_COST * step, tuple(sorted(span.parts)))
+    ends = np.array([span.first, span.last])
+    point, is_bad = case.point[ends], case.is_bad[ends]
+    if is_bad.any():
+        exits = zone.exits(point, case.region)
+        if exits is None or bool((zone.regions(exits) != case.region)[is_bad].any()):
+            return None
+        point = np.where(is_bad[:, None], exits, point)
+    steps = span.last - span.first
+    hop_cost = _HOP_COST * arc_length(case.point[span.first : span.last + 1])[-1] / max(steps, 1)
+    # A track that need not arrive may take a way with more corners than it has steps.
+    corners = MAX_CORNERS if span.is_open_start or span.is_open_end else steps - 1
+    return Request(point[0], point[1], corners, hop_cost, tuple(sorted(span.parts)))
 
 
 def _barrier(case: _Case, span: _Span, path: FloatArray, zone: Zone) -> FloatArray | None:
@@ -307,54 +311,66 @@ def _barrier(case: _Case, span: _Span, path: FloatArray, zone: Zone) -> FloatArr
 
 def _place_case(case: _Case, is_strict: bool) -> FloatArray | None:
     """The positions [n, 2] of the leg with every span laid along its path; `is_strict` keeps to the spans' own steps."""
-    point = case.point.copy()
+    point, end = case.point.copy(), len(case.point) - 1
     for index, span in enumerate(case.spans):
         floor = 0 if index == 0 else (case.spans[index - 1].last + span.first) // 2
-        ceiling = len(point) - 1 if index + 1 == len(case.spans) else (span.last + case.spans[index + 1].first) // 2
-        is_open = span.is_open_start or span.is_open_end
-        low, high = (span.first, span.last) if is_strict or is_open else _share(case.point, span, floor, ceiling)
-        new = _lay(case.point[low : high + 1], span, span.first - low, high - span.last)
+        ceiling = end if index + 1 == len(case.spans) else (span.last + case.spans[index + 1].first) // 2
+        is_open = (span.is_open_start, span.is_open_end)
+        low, high = span.first, span.last
+        if not is_strict and not any(is_open):
+            low, high = _share(case.point, span, floor, ceiling)
+            if _stretch(case.point, span, low, high) > _STRETCH:
+                # Rather than run, a track that need not arrive arrives later, or comes from less far.
+                is_open_end = high == end and not case.is_pinned[1]
+                is_open = (low == 0 and not case.is_pinned[0] and not is_open_end, is_open_end)
+        assert span.path is not None
+        path = np.concatenate([case.point[low : span.first], span.path, case.point[span.last + 1 : high + 1]])
+        bends = slice(span.first - low + 1, len(path) - 1 - (high - span.last))
+        new = _lay(case.point[low : high + 1], path, bends, is_open)
         if new is None:
             return None
         point[low : high + 1] = new
     return point
 
 
+def _stretch(point: FloatArray, span: _Span, low: int, high: int) -> float:
+    """How much longer the way low..high of a leg becomes by the detour of a span."""
+    assert span.path is not None
+    walked = arc_length(point)
+    old = walked[high] - walked[low]
+    new = old + arc_length(span.path)[-1] - (walked[span.last] - walked[span.first])
+    return float(new / old) if old > 0 else np.inf
+
+
 def _share(point: FloatArray, span: _Span, floor: int, ceiling: int) -> tuple[int, int]:
     """The fewest steps around a span, low..high, that share its detour so that none becomes much longer than it was."""
-    assert span.path is not None
-    walked, detour = arc_length(point), arc_length(span.path)[-1]
     low, high = span.first, span.last
-    while low > floor or high < ceiling:
-        old = walked[high] - walked[low]
-        if old + detour - (walked[span.last] - walked[span.first]) <= _STRETCH * old:
-            break
+    while (low > floor or high < ceiling) and _stretch(point, span, low, high) > _STRETCH:
         grow = 1 + (high - low) // 8
         low, high = max(floor, low - grow), min(ceiling, high + grow)
     return low, high
 
 
-def _lay(old: FloatArray, span: _Span, before: int, after: int) -> FloatArray | None:
-    """Steps old [n, 2] laid along the path of the span, with `before` and `after` further steps of the old way at its ends."""
-    assert span.path is not None
-    path = np.concatenate([old[:before], span.path, old[len(old) - after :]])
+def _lay(old: FloatArray, path: FloatArray, bends: slice, is_open: tuple[bool, bool]) -> FloatArray | None:
+    """Steps old [n, 2] laid along a path [P, 2], hitting the vertices `bends`; to its end or, if open, as far as before."""
     if len(old) == 1:
         return path[:1]
-    # Towards an open end a track walks on as far as it would have, from an open start it comes likewise.
-    is_reversed = span.is_open_start and not span.is_open_end
-    if is_reversed:
-        old, path, before, after = old[::-1], path[::-1], after, before
+    if is_open == (True, False):
+        count = len(path)
+        bends = slice(count - bends.stop, count - bends.start)
+        new = _lay(old[::-1], path[::-1], bends, (False, True))
+        return None if new is None else new[::-1]
     walked = arc_length(path)
-    is_open = span.is_open_start or span.is_open_end
-    length = min(walked[-1], arc_length(old)[-1]) if is_open else walked[-1]
-    new = place(old, path, walked[before + 1 : len(walked) - after - 1], float(length))
-    if new is None:
-        return None
-    if not (span.is_open_start and span.is_open_end):
-        new[0] = old[0]
-    if not is_open:
+    length, corners = float(walked[-1]), walked[bends]
+    if any(is_open):
+        length = min(length, _STRETCH * float(arc_length(old)[-1]))
+        # With fewer steps than corners the last step stays at a corner.
+        corners = corners[corners > 0]
+        length = min(length, *corners[len(old) - 2 : len(old) - 1].tolist(), length)
+    new = place(old, path, corners, length)
+    if new is not None and not any(is_open):
         new[-1] = old[-1]
-    return new[::-1] if is_reversed else new
+    return new
 
 
 def _blocked(points: Sequence[FloatArray | None], zone: Zone) -> list[bool]:

@@ -18,9 +18,10 @@ from cadence.constraints.obstacles import Obstacles
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
 
-_MAX_CORNERS = 96
+_MAX_BENDS = 96
 """Corners of one component that take part in a search; larger outlines are simplified, outwards."""
-_MAX_HOPS = 24
+MAX_CORNERS = 24
+"""The most corners of one route."""
 _CHUNK = 20_000_000
 
 
@@ -239,7 +240,7 @@ class _Graph:
         row = np.arange(len(requests))
         hops, corner = np.zeros_like(allowed), np.zeros_like(allowed)
         reach, came_from = first + hop, []
-        for level in range(1, min(int(allowed.max()), _MAX_HOPS) + 1):
+        for level in range(1, min(int(allowed.max()), MAX_CORNERS) + 1):
             if not reach.size or bool((reach.min(axis=1) >= best).all()):
                 break
             total = np.where(allowed[:, None] >= level, reach + last, np.inf)
@@ -285,7 +286,7 @@ def _bends(part: Any, clearance_m: float) -> FloatArray:
     """Corners of a component that a shortest route can bend at, and a few farther out for tracks with few steps."""
     shape, tolerance = part, clearance_m
     corners = _convex_corners(shape)
-    while len(corners) > _MAX_CORNERS and tolerance < 1e6 * clearance_m:
+    while len(corners) > _MAX_BENDS and tolerance < 1e6 * clearance_m:
         # A line simplified by less than it was moved out still lies outside of where it came from.
         shape = part.buffer(tolerance, join_style="mitre", mitre_limit=2.5).simplify(0.9 * tolerance)
         corners, tolerance = _convex_corners(shape), 2 * tolerance
