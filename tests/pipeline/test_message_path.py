@@ -60,7 +60,9 @@ def test_plural_only_with_slice_or_filter() -> None:
     assert parse_path("header{total==4}.stamp").is_plural
 
 
-@pytest.mark.parametrize("text", ["", "a..b", "a[", "a[]", "a[x]", "a[1:2:3]", "a[--1]", "a{b}", "a{b==}", "a b", "a.", "/topic.x"])
+@pytest.mark.parametrize(
+    "text", ["", "a..b", "a[", "a[]", "a[x]", "a[1:2:3]", "a[--1]", "a{b}", "a{b==}", "a b", "a.", "/topic.x"]
+)
 def test_wrong_paths_say_where(text: str) -> None:
     with pytest.raises(ValueError, match="message path") as caught:
         parse_path(text)
