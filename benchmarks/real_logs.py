@@ -40,17 +40,18 @@ RESULT_VERSION = 1
 
 @dataclass(frozen=True)
 class Case:
-    """A log, its dense channel, and the mean length of a burst of detections."""
+    """A log, its dense channel, the mean length of a burst of detections, and the steps from one window to the next."""
 
     path: str
     truth: SourceConfig
     mean_burst_s: float
+    stride_steps: int
 
 
 CASES = {
-    "flight": Case("flights/cubs2_cub_stabilize.mcap", SourceConfig("/cub1/pose", agent="cub1"), 1.0),
-    "ships": Case("maritime/solent_ais_known.mcap", SourceConfig("/truth/{agent}"), 20.0),
-    "aircraft": Case("flights/calfire_adsb_known.mcap", SourceConfig("/truth/{agent}"), 60.0),
+    "flight": Case("flights/cubs2_cub_stabilize.mcap", SourceConfig("/cub1/pose", agent="cub1"), 1.0, 4),
+    "ships": Case("maritime/solent_ais_known.mcap", SourceConfig("/truth/{agent}"), 20.0, 8),
+    "aircraft": Case("flights/calfire_adsb_known.mcap", SourceConfig("/truth/{agent}"), 60.0, 16),
 }
 
 ESTIMATORS: Mapping[str, Callable[[Detections, float], Estimator]] = dict(RIVALS)
@@ -127,7 +128,7 @@ def run_setting(
     prepare(setting, directory, progress)
     detections, _ = read_table(directory / "detections.parquet", "detections")
     truth, _ = read_table(directory / "truth.parquet", "truth")
-    grid = plan_grid(detections, GridConfig())
+    grid = plan_grid(detections, GridConfig(stride_steps=CASES[setting.log].stride_steps))
     windows = build_windows(detections, grid, setting.seed)
     max_gap_s = default_truth_gap_s(truth, grid.step_s)
     truth_m, is_known = truth_on_grid(truth, windows, max_gap_s)
@@ -376,7 +377,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--work", type=Path, default=WORK, help="results so far (default %(default)s)")
     parser.add_argument("--logs", nargs="+", choices=CASES, default=list(CASES))
     parser.add_argument("--rates", nargs="+", type=float, default=list(RATES))
-    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2, 3, 4])
     parser.add_argument("--estimators", nargs="+", choices=ESTIMATORS, default=list(ESTIMATORS))
     parser.add_argument("--again", nargs="+", choices=ESTIMATORS, default=[], help="do these again though they have results")
     parser.add_argument("--hypotheses", type=int, default=50, help="joint samples a window (default %(default)s)")

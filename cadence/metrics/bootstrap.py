@@ -50,8 +50,10 @@ def bootstrap_ratio(
     num_groups = int(group.max()) + 1 if group.size else 0
     sides = [np.bincount(group, side[is_valid], num_groups).astype(np.float64) for side in (top, bottom)]
     sums = np.stack(sides, axis=1)  # [G, 2]
-    low, high = (np.nan, np.nan) if num_groups < 2 else _percentiles(sums, rng, num_resamples, level)
-    return Interval(_quotient(sums.sum(axis=0)).item(), low, high, int(is_valid.sum()), num_groups)
+    value = _quotient(sums.sum(axis=0)).item()
+    is_defined = num_groups >= 2 and not np.isnan(value)
+    low, high = _percentiles(sums, rng, num_resamples, level) if is_defined else (np.nan, np.nan)
+    return Interval(value, low, high, int(is_valid.sum()), num_groups)
 
 
 def _percentiles(sums: NDArray[np.float64], rng: np.random.Generator, num_resamples: int, level: float) -> tuple[float, float]:
