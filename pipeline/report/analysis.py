@@ -34,12 +34,15 @@ class FanShape:
     @property
     def spread_m(self) -> Floats:
         """Root mean square distance to the mean [T]."""
-        return np.sqrt((self.axes_m**2).sum(axis=1))
+        return np.asarray(np.hypot(self.axes_m[:, 0], self.axes_m[:, 1]))
 
 
 def shape_of(fan: Fan) -> FanShape:
-    """Weighted mean, principal axes and the empirical envelopes of a fan: at every step the smallest ellipse with the
-    axes of the weighted covariance that holds the share of the weight."""
+    """Weighted mean, principal axes and the empirical envelopes of a fan.
+
+    An envelope is, at every step, the smallest ellipse with the axes of the weighted covariance that holds the share of
+    the weight.
+    """
     offset_m = fan.offset_m.astype(np.float64)
     mean_m = np.einsum("k,ktd->td", fan.weight, offset_m)
     centred = offset_m - mean_m
@@ -98,8 +101,8 @@ def truth_errors(fan: Fan, shape: FanShape, truth: Points) -> tuple[Floats, npt.
 class Analysis:
     """What was computed over all fans.
 
-    shapes: by position in `Mission.fans`, kept only for what is drawn; spread_now_m, spread_end_m, error_now_m [fans]
-    (NaN: unknown); past, future: scores against truth, None without any
+    By position in `Mission.fans`: spread_now_m at the origin, spread_end_m at the last step, error_now_m of the mean at
+    the origin (NaN where truth is silent). past, future: scores against truth, None without any.
     """
 
     spread_now_m: Floats
@@ -114,6 +117,7 @@ class Analyser:
 
     def __init__(self, mission: Mission) -> None:
         self._truth = {agent: mission.truth.of(agent) for agent in range(len(mission.agents))} if mission.truth else {}
+        self._detected_ns = [mission.detections.of(agent).time_ns for agent in range(len(mission.agents))]
         self._now: list[float] = []
         self._end: list[float] = []
         self._error: list[float] = []
@@ -128,12 +132,19 @@ class Analyser:
         error = float("nan")
         if fan.agent in self._truth and len(self._truth[fan.agent]) > 1:
             errors, inside = truth_errors(fan, shape, self._truth[fan.agent])
+            errors[fan.time_ns < self._first_ns(fan)] = np.nan
             error = float(errors[fan.origin_index])
             for side, part in enumerate((slice(None, fan.origin_index + 1), slice(fan.origin_index + 1, None))):
                 known = np.isfinite(errors[part])
                 self._errors[side].append(errors[part][known])
                 self._inside[side].append(inside[part][known])
         self._error.append(error)
+
+    def _first_ns(self, fan: Fan) -> int:
+        """The first detection in the window: as in evaluate, steps before it are not compared."""
+        time_ns = self._detected_ns[fan.agent]
+        place = int(np.searchsorted(time_ns, fan.time_ns[0]))
+        return int(time_ns[place]) if place < len(time_ns) else int(fan.origin_ns)
 
     def result(self) -> Analysis:
         """The numbers so far."""

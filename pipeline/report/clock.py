@@ -46,7 +46,10 @@ class Clock:
         return self.start_ns >= CALENDAR_FROM_NS
 
     def moment(self, time_ns: int, decimals: int = 0) -> str:
-        """A time within the mission: 12:34:56, with the date where the mission lasts over midnight; T+00:01:05 without a calendar."""
+        """A time within the mission: 12:34:56, or T+00:01:05 without a calendar.
+
+        The date is added where the mission lasts over midnight.
+        """
         unit = 10 ** (9 - decimals)
         if self.is_calendar:
             seconds, rest = divmod(time_ns // unit, 10**decimals)

@@ -33,8 +33,10 @@ class GeodesyFit:
 
 
 def fit_geodesy(frame: Frame, low_m: Floats, high_m: Floats) -> GeodesyFit | None:
-    """A fit over the square around [low_m, high_m] and half as much again; None where the frame has no datum, or where
-    the fit would be wrong by over a metre (areas of a continent's size)."""
+    """A fit over the square around [low_m, high_m] and half as much again.
+
+    None where the frame has no datum, or where the fit would be wrong by over a metre (areas of a continent's size).
+    """
     if frame.latitude_deg is None or frame.longitude_deg is None:
         return None
     centre_m = (low_m + high_m) / 2

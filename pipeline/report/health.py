@@ -10,6 +10,21 @@ from pipeline.report.mission import Mission
 MAX_CHANNELS = 200
 MAX_ENTRIES = 50
 
+LEFT_OUT = {
+    "collapsed": "simultaneous detections merged into others",
+    "undecodable": "messages that cannot be decoded",
+    "incomplete": "messages without a position where the mapping looks",
+    "no_fix": "positions marked as having no fix",
+    "dropped_nonfinite": "positions that are NaN, infinite or off the earth",
+    "bad_covariance": "covariances that were replaced by the default",
+    "out_of_order": "time stamps out of order, sorted",
+    "outside_time_cut": "positions outside the chosen time span",
+    "other_frame": "positions in another frame, left out",
+    "spikes": "positions far off their track, left out",
+    "duplicate_truth": "repeated truth positions, left out",
+}
+"""Counts of extract's summary in words."""
+
 
 def health_section(mission: Mission) -> str:
     """Completeness, problems, lost spans, counts of extract, and the channels."""
@@ -19,11 +34,19 @@ def health_section(mission: Mission) -> str:
     known = {"is_complete", "problems", "lost_spans_ns"}
     rows = [(label(key), text(value)) for key, value in flatten(health) if key.split(".")[0] not in known]
     left = f"<div><h3>Log</h3>{pairs(rows)}</div>" if rows else ""
-    summary = mission.manifests.get("extract", {}).get("summary", {})
-    rows = [(label(key), text(value)) for key, value in flatten(summary)[:MAX_ENTRIES]]
+    summary = mission.manifests.get("extract", {}).get("summary") or {}
+    rows = _extraction(summary)
     right = f"<div><h3>Extraction</h3>{pairs(rows)}</div>" if rows else ""
     content += f'<div class="columns">{left}{right}</div>' + _channels(mission)
     return section("Health of the log", content)
+
+
+def _extraction(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """What extract counted: what was left out in words, the rest by its name."""
+    rows = [(text(words), text(summary[key])) for key, words in LEFT_OUT.items() if key in summary]
+    # The log's own part of the page tells of these already.
+    known = {*LEFT_OUT, "lost_spans_ns", "is_complete", "frame"}
+    return [(label(key), text(value)) for key, value in flatten(summary)[:MAX_ENTRIES] if key.split(".")[0] not in known] + rows
 
 
 def _verdict(health: Mapping[str, Any]) -> str:
@@ -46,7 +69,11 @@ def _problems(health: Mapping[str, Any]) -> str:
 def _lost_spans(mission: Mission, health: Mapping[str, Any]) -> str:
     clock = Clock(mission.start_ns, mission.end_ns)
     rows = [
-        [text(clock.moment(int(first), 3)), text(clock.moment(int(last), 3)), text(duration(max(int(last) - int(first), 0) / 1e9))]
+        [
+            text(clock.moment(int(first), 3)),
+            text(clock.moment(int(last), 3)),
+            text(duration(max(int(last) - int(first), 0) / 1e9)),
+        ]
         for first, last in (health.get("lost_spans_ns") or [])[:MAX_ENTRIES]
     ]
     return f"<h3>Lost spans (log time)</h3>{table(['from', 'to', 'length'], rows)}" if rows else ""
@@ -56,10 +83,14 @@ def _channels(mission: Mission) -> str:
     channels = [entry for entry in mission.catalogue.get("channels") or [] if isinstance(entry, dict)]
     if not channels:
         return ""
-    wanted = ("topic", "schema_name", "message_encoding", "encoding", "message_count", "rate_hz", "role")
+    wanted = ("topic", "schema_name", "encoding", "num_messages", "mean_rate_hz", "frame_id", "reason")
     heads = [key for key in wanted if any(key in entry for entry in channels)]
     rows = [[text(entry.get(key, "")) for key in heads] for entry in channels[:MAX_CHANNELS]]
-    rest = f'<p class="note">{len(channels) - MAX_CHANNELS} more channels are in catalogue.json.</p>' if len(channels) > MAX_CHANNELS else ""
-    numeric = [heads.index(key) for key in ("message_count", "rate_hz") if key in heads]
+    rest = (
+        f'<p class="note">{len(channels) - MAX_CHANNELS} more channels are in catalogue.json.</p>'
+        if len(channels) > MAX_CHANNELS
+        else ""
+    )
+    numeric = [heads.index(key) for key in ("num_messages", "mean_rate_hz") if key in heads]
     body = table([key.replace("_", " ") for key in heads], rows, numeric)
     return f"<details><summary>{len(channels)} channels</summary>{body}{rest}</details>"

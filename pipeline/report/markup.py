@@ -23,8 +23,7 @@ def text(value: object) -> str:
         shown = str(value) if isinstance(value, int) else json.dumps(value, ensure_ascii=False, sort_keys=True)
     if len(shown) > MAX_VALUE_CHARACTERS:
         shown = f"{shown[:MAX_VALUE_CHARACTERS]}… ({len(shown):,} characters)"
-    # Lone surrogates, as broken JSON may hold, cannot be written as UTF-8.
-    return escape(shown.encode("utf-8", "replace").decode("utf-8"))
+    return escape(shown)
 
 
 def label(key: object) -> str:
@@ -32,18 +31,28 @@ def label(key: object) -> str:
     return text(str(key).replace("_", " "))
 
 
-def section(title: str, content: str, lead: str = "", kind: str = "", identity: str = "") -> str:
+def section(title: str, content: str, lead: str = "", kind: str = "") -> str:
     """A card; `lead` is text, `content` is HTML."""
-    opening = f'<section{f" id={identity}" if identity else ""}{f" class={json.dumps(kind)}" if kind else ""}><h2>{text(title)}</h2>'
-    return opening + (f"<p>{escape(lead)}</p>" if lead else "") + content + "</section>\n"
+    opening = f'<section class="{kind}">' if kind else "<section>"
+    return f"{opening}<h2>{text(title)}</h2>{f'<p>{escape(lead)}</p>' if lead else ''}{content}</section>\n"
 
 
-def table(heads: Sequence[str], rows: Iterable[Sequence[str]], numeric: Sequence[int] = ()) -> str:
+def legend(keys: Iterable[tuple[str, str]]) -> str:
+    """A list of small drawings (SVG of 26 by 16) with their words."""
+    items = "".join(
+        f'<li><svg width="26" height="16" aria-hidden="true">{drawing}</svg>{text(words)}</li>' for drawing, words in keys
+    )
+    return f'<ul class="legend">{items}</ul>'
+
+
+def table(heads: Sequence[str], rows: Iterable[Sequence[str]], numeric: Sequence[int] = (), kind: str = "") -> str:
     """A table from cells that are HTML already; `numeric` columns are set to the right."""
-    kinds = [' class="number"' if column in numeric else "" for column in range(len(heads))]
-    head = "".join(f"<th{kind}>{text(name)}</th>" for kind, name in zip(kinds, heads, strict=True))
-    body = "".join("<tr>" + "".join(f"<td{kind}>{cell}</td>" for kind, cell in zip(kinds, row, strict=True)) + "</tr>\n" for row in rows)
-    return f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
+    classes = [' class="number"' if column in numeric else "" for column in range(len(heads))]
+    head = "".join(f"<th{extra}>{text(name)}</th>" for extra, name in zip(classes, heads, strict=True))
+    lines = ("".join(f"<td{extra}>{cell}</td>" for extra, cell in zip(classes, row, strict=True)) for row in rows)
+    body = "".join(f"<tr>{line}</tr>\n" for line in lines)
+    opening = f'<table class="{kind}">' if kind else "<table>"
+    return f'<div class="scroll">{opening}<thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
 
 
 def pairs(rows: Iterable[tuple[str, str]]) -> str:
@@ -63,11 +72,13 @@ def flatten(value: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any]]
     return rows
 
 
-def as_toml(tables: Mapping[str, Any]) -> str:
+def as_toml(tables: Mapping[str, Mapping[str, Any]]) -> str:
     """Configuration tables as TOML that `pipeline.config` reads back to the same values; unset keys are left out."""
     lines = []
     for name, values in tables.items():
-        lines += [f"[{_toml_key(name)}]", *(f"{_toml_key(key)} = {_toml(item)}" for key, item in values.items() if item is not None), ""]
+        lines.append(f"[{_toml_key(name)}]")
+        lines += [f"{_toml_key(key)} = {_toml(item)}" for key, item in values.items() if item is not None]
+        lines.append("")
     return "\n".join(lines)
 
 
@@ -79,7 +90,6 @@ def _toml(value: Any) -> str:
     if isinstance(value, list | tuple):
         return "[" + ", ".join(_toml(item) for item in value) + "]"
     if isinstance(value, int | float):
-        # JSON has no word for infinity and reads Python's back as a float: TOML calls it inf, and not-a-number nan.
         return repr(value)
     return _toml_string(str(value))
 

@@ -6,6 +6,7 @@ unless a name says otherwise.
 
 import json
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,8 @@ import numpy.typing as npt
 import pyarrow as pa
 
 from cadence.errors import InputError
-from pipeline.manifest import read_manifest
+from pipeline.manifest import hash_file, read_manifest
+from pipeline.results import AgentHypotheses, MissionHypotheses, WindowHypotheses, read_hypothesis_tables
 from pipeline.tables import Frame, read_table
 
 Floats = npt.NDArray[np.float64]
@@ -117,6 +119,7 @@ class Mission:
     obstacles: tuple[Obstacle, ...]
     manifests: dict[str, JsonDict]
     scores: JsonDict | None
+    has_stale_scores: bool
     start_ns: int
     end_ns: int
 
@@ -137,15 +140,15 @@ def load_mission(directory: Path) -> Mission:
     """The mission in `directory`; `InputError` where a file that the page cannot do without is absent or damaged."""
     catalogue = _read_json(directory / "catalogue.json")
     detections, frame = read_table(directory / "detections.parquet", "detections")
-    windows, _ = read_table(directory / "windows.parquet", "windows")
-    hypotheses, _ = read_table(directory / "hypotheses.parquet", "hypotheses")
+    hypotheses = read_hypothesis_tables(directory)
     truth = _optional_table(directory, "truth")
     poses = _optional_table(directory, "poses")
-    tables = [table for table in (detections, windows, hypotheses, truth) if table is not None]
-    agents = _names(*(table["agent_id"] for table in tables))
-    sensors = _names(poses["sensor_id"]) if poses is not None else ()
-    rows = _window_rows(windows, agents)
+    tables = [table for table in (detections, truth) if table is not None]
+    agents = _names(*(table["agent_id"].unique().to_pylist() for table in tables), hypotheses.agent_ids)
+    sensors = _names(poses["sensor_id"].unique().to_pylist()) if poses is not None else ()
+    rows = _window_rows(hypotheses, agents)
     scores = directory / "scores.json"
+    manifests = {stage: found for stage in STAGES if (found := read_manifest(stage, directory)) is not None}
     detection_points = _points(detections, "agent_id", agents)
     truth_points = _points(truth, "agent_id", agents) if truth is not None else None
     start_ns, end_ns = _time_range(catalogue, [points for points in (detection_points, truth_points) if points], rows)
@@ -161,11 +164,18 @@ def load_mission(directory: Path) -> Mission:
         rows=rows,
         fans=_fans(hypotheses, agents),
         obstacles=_obstacles(directory / "obstacles.json"),
-        manifests={stage: found for stage in STAGES if (found := read_manifest(stage, directory)) is not None},
+        manifests=manifests,
         scores=_read_json(scores) if scores.is_file() else None,
+        has_stale_scores=_is_stale(manifests.get("evaluate"), directory / "hypotheses.parquet"),
         start_ns=start_ns,
         end_ns=end_ns,
     )
+
+
+def _is_stale(manifest: JsonDict | None, path: Path) -> bool:
+    """Whether the manifest names another content for the input at `path`."""
+    digest = (manifest or {}).get("inputs", {}).get(path.name)
+    return digest is not None and digest != hash_file(path)
 
 
 def _read_json(path: Path) -> JsonDict:
@@ -185,9 +195,9 @@ def _optional_table(directory: Path, name: str) -> pa.Table | None:
     return read_table(path, name)[0] if path.is_file() else None
 
 
-def _names(*columns: pa.ChunkedArray) -> tuple[str, ...]:
+def _names(*columns: Iterable[str | None]) -> tuple[str, ...]:
     """Every name once, numbers inside names in the order of numbers (T2 before T10)."""
-    found = {name for column in columns for name in column.unique().to_pylist() if name is not None}
+    found = {name for column in columns for name in column if name is not None}
     return tuple(sorted(found, key=_natural))
 
 
@@ -200,8 +210,8 @@ def _natural(name: str) -> tuple[list[str | int], str]:
 def _index(column: pa.ChunkedArray, names: tuple[str, ...]) -> Ints:
     order = {name: index for index, name in enumerate(names)}
     encoded = column.combine_chunks().dictionary_encode()
-    lookup = np.array([order[name] for name in encoded.dictionary.to_pylist()] + [-1], dtype=np.int64)
-    return lookup[encoded.indices.fill_null(len(lookup) - 1).to_numpy(zero_copy_only=False)]
+    lookup: Ints = np.array([*(order[name] for name in encoded.dictionary.to_pylist()), -1], dtype=np.int64)
+    return np.asarray(lookup[encoded.indices.fill_null(len(lookup) - 1).to_numpy(zero_copy_only=False)])
 
 
 def _points(table: pa.Table, column: str, names: tuple[str, ...]) -> Points:
@@ -213,55 +223,41 @@ def _points(table: pa.Table, column: str, names: tuple[str, ...]) -> Points:
     return Points(time_ns[usable][order], owner[usable][order], position_m[usable][order])
 
 
-def _window_rows(table: pa.Table, agents: tuple[str, ...]) -> tuple[WindowRow, ...]:
-    agent = _index(table["agent_id"], agents)
-    rows = []
-    for index, row in zip(agent.tolist(), table.to_pylist(), strict=True):
-        age_s, spread_m = (None if row[key] is None or not np.isfinite(row[key]) else row[key] for key in ("age_s", "spread_m"))
-        rows.append(
-            WindowRow(
-                row["window"],
-                index,
-                row["origin_ns"],
-                row["status"],
-                row["advice"] or "",
-                row["num_detections"],
-                age_s,
-                spread_m,
-            )
+def _window_rows(found: MissionHypotheses, agents: tuple[str, ...]) -> tuple[WindowRow, ...]:
+    place = {name: index for index, name in enumerate(agents)}
+    return tuple(
+        WindowRow(
+            window.window, place[agent.agent_id], window.origin_ns, agent.status, agent.advice or "", agent.num_detections,
+            agent.age_s, agent.spread_m,
         )
-    return tuple(sorted(rows, key=lambda row: (row.origin_ns, row.window, row.agent)))
+        for window in found.windows
+        for agent in sorted(window.agents, key=lambda agent: place[agent.agent_id])
+    )  # fmt: skip
 
 
-def _fans(table: pa.Table, agents: tuple[str, ...]) -> tuple[Fan, ...]:
-    if len(table) == 0:
-        return ()
-    column = table["position_m"].combine_chunks()
-    num_steps = column.type.list_size
-    offset_m = column.flatten().flatten().to_numpy().reshape(len(table), num_steps, 2)
-    agent = _index(table["agent_id"], agents)
-    window, origin_ns = table["window"].to_numpy(), table["origin_ns"].to_numpy()
-    step_ns, origin_index = table["step_ns"].to_numpy(), table["origin_index"].to_numpy()
-    weight = table["weight"].to_numpy().astype(np.float64)
-    datum_m = np.column_stack([table["datum_x_m"].to_numpy(), table["datum_y_m"].to_numpy()])
-    order = np.lexsort((table["hypothesis"].to_numpy(), agent, window, origin_ns))
-    starts = np.flatnonzero(np.diff(window[order], prepend=-1) | np.diff(agent[order], prepend=-1))
-    fans = []
-    for rows in np.split(order, starts[1:]):
-        # One window and agent share their datum; hypotheses with a hole in them cannot be drawn.
-        rows = rows[np.isfinite(offset_m[rows]).all(axis=(1, 2))]
-        if len(rows) == 0:
-            continue
-        first = rows[0]
-        total = weight[rows].sum()
-        share = weight[rows] / total if total > 0 else np.full(len(rows), 1.0 / len(rows))
-        fans.append(
-            Fan(
-                int(window[first]), int(agent[first]), int(origin_ns[first]), int(step_ns[first]), int(origin_index[first]),
-                share, datum_m[first], offset_m[rows],
-            )
-        )  # fmt: skip
-    return tuple(fans)
+def _fans(found: MissionHypotheses, agents: tuple[str, ...]) -> tuple[Fan, ...]:
+    place = {name: index for index, name in enumerate(agents)}
+    fans = (
+        _fan(window, agent, place[agent.agent_id])
+        for window in found.windows
+        for agent in sorted(window.agents, key=lambda agent: place[agent.agent_id])
+        if agent.is_live
+    )
+    return tuple(fan for fan in fans if fan is not None)
+
+
+def _fan(window: WindowHypotheses, agent: AgentHypotheses, index: int) -> Fan | None:
+    # Hypotheses with a hole in them cannot be drawn.
+    usable = np.isfinite(agent.position_m).all(axis=(1, 2))
+    weight = window.weight[usable].astype(np.float64)
+    if len(weight) == 0:
+        return None
+    share = weight / weight.sum() if weight.sum() > 0 else np.full(len(weight), 1 / len(weight))
+    # A view where all are usable: copies of everything would double the memory of a large mission.
+    offset_m = agent.position_m if usable.all() else agent.position_m[usable]
+    return Fan(
+        window.window, index, window.origin_ns, window.step_ns, window.origin_index, share, np.array(agent.datum_m), offset_m
+    )
 
 
 def _obstacles(path: Path) -> tuple[Obstacle, ...]:

@@ -132,6 +132,7 @@
   }
 
   // ---- drawing -------------------------------------------------------------
+  const labelBoxes = [];
   const LIGHT = { card: "#ffffff", text: "#1b2430", muted: "#586472", faint: "#eef1f4", past: "#0072b2", future: "#d55e00", truth: "#009e73", sensor: "#cc79a7", obstacle: "#7d8894", detection: "#111820" };
   function colours() {
     if (state.isPrinting) return LIGHT;
@@ -223,6 +224,8 @@
     drawGrid(colour);
     if (layers.obstacles) drawObstacles(colour);
     const visible = [...state.agents].map((agent) => fanAt.get(state.window * 65536 + agent)).filter(Boolean);
+    labelBoxes.length = 0;
+    if (layers.everywhere) drawEverywhere(colour);
     if (layers.sensors) drawSensors(colour);
     if (layers.envelopes) inMetres(() => visible.forEach((fan) => drawEnvelopes(fan, colour)));
     inMetres(() => visible.forEach((fan) => drawHypotheses(fan, colour)));
@@ -230,6 +233,7 @@
     if (layers.mean) inMetres(() => visible.forEach((fan) => drawMean(fan, colour)));
     if (layers.detections) drawDetections(colour);
     visible.forEach((fan) => drawNow(fan, colour, visible.length));
+    if (layers.names) visible.forEach((fan) => { const [x, y] = nowOf(fan); label(data.agents[fan.agent], x + 9, y - 7, colour.text, colour); });
     drawFurniture(colour);
   }
 
@@ -341,15 +345,30 @@
     }
     pen.globalAlpha = 1;
   }
+  // The whole mission, faintly: where this window lies in it.
+  function drawEverywhere(colour) {
+    if (!detections) return;
+    pen.fillStyle = colour.detection; pen.globalAlpha = 0.22;
+    for (let i = 0; i < detections.time.length; i++) {
+      const owner = detections.owner[i];
+      if (owner < 0 || state.agents.has(shownOf.get(owner))) pen.fillRect(screenX(detections.position[2 * i]) - 1, screenY(detections.position[2 * i + 1]) - 1, 2, 2);
+    }
+    pen.globalAlpha = 1;
+  }
+  const nowOf = (fan) => [screenX(fan.x + fan.summary[6 * fan.now] * fan.scale), screenY(fan.y + fan.summary[6 * fan.now + 1] * fan.scale)];
   function drawNow(fan, colour, count) {
-    const x = screenX(fan.x + fan.summary[6 * fan.now] * fan.scale), y = screenY(fan.y + fan.summary[6 * fan.now + 1] * fan.scale);
+    const [x, y] = nowOf(fan);
     pen.strokeStyle = colour.text; pen.lineWidth = 1.6;
     pen.beginPath(); pen.arc(x, y, count > 12 ? 4.5 : 6, 0, 2 * Math.PI); pen.stroke();
-    if (layers.names) label(data.agents[fan.agent], x + 9, y - 7, colour.text, colour);
   }
   function label(text, x, y, fill, colour) {
     const shown = text.length > 24 ? `${text.slice(0, 23)}…` : text;
-    pen.font = "12px system-ui, sans-serif"; pen.lineWidth = 3; pen.strokeStyle = colour.card; pen.fillStyle = fill;
+    pen.font = "12px system-ui, sans-serif";
+    // A name that would cover another one is left out; zooming in brings it back.
+    const box = [x, y - 11, x + pen.measureText(shown).width, y + 3];
+    if (labelBoxes.some((other) => box[0] < other[2] && other[0] < box[2] && box[1] < other[3] && other[1] < box[3])) return;
+    labelBoxes.push(box);
+    pen.lineWidth = 3; pen.strokeStyle = colour.card; pen.fillStyle = fill;
     pen.globalAlpha = 0.8; pen.strokeText(shown, x, y); pen.globalAlpha = 1; pen.fillText(shown, x, y);
   }
   function drawFurniture(colour) {

@@ -1,22 +1,26 @@
 """The stage: mission directory in, report.html out."""
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from tqdm import tqdm
 
 from pipeline.manifest import JsonObject, StageResult, run_stage
 from pipeline.progress import Progress
-from pipeline.report.analysis import Analyser, Analysis, choose_moments, shape_of
+from pipeline.report.analysis import Analyser, Analysis, Moment, choose_moments, shape_of
+from pipeline.report.fans import Detail, FanCode, choose_detail, encode_fan
 from pipeline.report.geodesy import fit_geodesy
-from pipeline.report.mission import Mission, load_mission, mission_inputs
+from pipeline.report.mission import Floats, Mission, load_mission, mission_inputs
 from pipeline.report.page import write_page
-from pipeline.report.payload import Detail, FanCode, Payload, build_payload, choose_detail, encode_fan
+from pipeline.report.payload import Payload, build_payload
 
-OTHER_BYTES = 1_200_000
-"""Room for everything in the page that is not a fan of the interactive map."""
+FIXED_BYTES, BYTES_A_POINT, BYTES_A_CELL, BYTES_A_CHART_ROW = 250_000, 14, 32, 12_000
+"""Room for what is not a fan of the interactive map: text and small maps, points, window rows, charts."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +36,7 @@ class ReportConfig:
     max_megabytes: float = 5.0
     num_moments: int = 6
     max_hypotheses: int = 30
-    max_vertices: int = 48
+    max_vertices: int = 96
     max_points: int = 15_000
 
     def __post_init__(self) -> None:
@@ -56,11 +60,16 @@ def report(directory: Path, config: ReportConfig, progress: Progress, force: boo
 
     def body(work: Path) -> JsonObject:
         mission = load_mission(directory)
-        analysis, payload = _draw(mission, config, progress)
-        page = write_page(mission, analysis, payload, choose_moments(mission, analysis, config.num_moments))
-        (work / "report.html").write_text(page, encoding="utf-8", newline="\n")
+        with progress.bar(2 * len(mission.fans), "report", unit="fan") as bar:
+            analysis = _analyse(mission, bar)
+            moments = choose_moments(mission, analysis, config.num_moments)
+            payload = _payload(mission, config, moments, bar)
+        page = write_page(mission, analysis, payload, moments)
+        # Names come from logs: a lone surrogate in one must cost that letter, not the page.
+        content = page.encode("utf-8", "replace")
+        (work / "report.html").write_bytes(content)
         return {
-            "num_bytes": len(page.encode("utf-8")),
+            "num_bytes": len(content),
             "num_agents": len(mission.agents),
             "num_detections": len(mission.detections),
             "num_windows": len(mission.origins_ns),
@@ -75,30 +84,50 @@ def report(directory: Path, config: ReportConfig, progress: Progress, force: boo
 def _assets() -> list[Path]:
     # The look of the page is an input too: a newer style must not be skipped.
     folder = Path(str(resources.files("pipeline.report")))
-    return [folder / "page.css", folder / "page.js"]
+    return [folder / "page.css", folder / "page.js", folder / "explorer.html"]
 
 
-def _draw(mission: Mission, config: ReportConfig, progress: Progress) -> tuple[Analysis, Payload]:
+def _analyse(mission: Mission, bar: "tqdm[Any]") -> Analysis:
+    analyser = Analyser(mission)
+    for fan in mission.fans:
+        analyser.add(fan, shape_of(fan))
+        bar.update(1)
+    return analyser.result()
+
+
+def _payload(mission: Mission, config: ReportConfig, moments: Sequence[Moment], bar: "tqdm[Any]") -> Payload:
     wanted = Detail(len(mission.origins_ns), len(mission.agents), config.max_hypotheses, config.max_vertices)
-    detail = choose_detail(mission, max(config.max_megabytes * 1e6 - OTHER_BYTES, config.max_megabytes * 5e5), wanted)
-    windows, agents = _shown_windows(mission, detail.num_windows), _shown_agents(mission, detail.num_agents)
-    analyser, codes = Analyser(mission), list[FanCode]()
-    is_shown = (set(windows), set(agents))
-    with progress.bar(len(mission.fans), "report", unit="fan") as bar:
-        for fan in mission.fans:
-            shape = shape_of(fan)
-            analyser.add(fan, shape)
-            if fan.window in is_shown[0] and fan.agent in is_shown[1]:
-                codes.append(encode_fan(fan, shape, detail))
-            bar.update(1)
+    detail = choose_detail(mission, _budget_bytes(mission, config), wanted)
+    windows = _shown_windows(mission, detail.num_windows, [mission.fans[moment.fan].window for moment in moments])
+    agents = _shown_agents(mission, detail.num_agents)
+    shown_windows, shown_agents, codes = set(windows), set(agents), list[FanCode]()
+    for fan in mission.fans:
+        # Shapes are computed again rather than kept: those of a long mission do not fit into memory beside its hypotheses.
+        if fan.window in shown_windows and fan.agent in shown_agents:
+            codes.append(encode_fan(fan, shape_of(fan), detail))
+        bar.update(1)
     geodesy = fit_geodesy(mission.frame, *_extent(mission, codes))
-    return analyser.result(), build_payload(mission, codes, windows, agents, geodesy, config.max_points)
+    return build_payload(mission, codes, windows, agents, geodesy, config.max_points)
 
 
-def _shown_windows(mission: Mission, count: int) -> list[int]:
+def _budget_bytes(mission: Mission, config: ReportConfig) -> float:
+    points = [found for found in (mission.detections, mission.truth, mission.poses) if found is not None]
+    num_points = sum(min(len(found), config.max_points) for found in points)
+    others = (
+        FIXED_BYTES + num_points * BYTES_A_POINT + len(mission.rows) * BYTES_A_CELL + len(mission.agents) * BYTES_A_CHART_ROW
+    )
+    return max(config.max_megabytes * 1e6 - others, config.max_megabytes * 2e5)
+
+
+def _shown_windows(mission: Mission, count: int, always: Sequence[int]) -> list[int]:
+    """`count` windows evenly over the mission, and those `always` shown in place of their neighbours."""
     windows = list(mission.origins_ns)
-    chosen = np.unique(np.linspace(0, len(windows) - 1, min(count, len(windows))).round().astype(int)) if windows else []
-    return [windows[index] for index in chosen]
+    if count >= len(windows):
+        return windows
+    chosen = np.unique(np.linspace(0, len(windows) - 1, count).round().astype(int))
+    for place in sorted({windows.index(window) for window in always} - set(chosen.tolist())):
+        chosen[np.abs(chosen - place).argmin()] = place
+    return [windows[place] for place in np.unique(chosen)]
 
 
 def _shown_agents(mission: Mission, count: int) -> list[int]:
@@ -107,7 +136,7 @@ def _shown_agents(mission: Mission, count: int) -> list[int]:
     return sorted(ranked[:count])
 
 
-def _extent(mission: Mission, codes: list[FanCode]) -> tuple[np.ndarray, np.ndarray]:
+def _extent(mission: Mission, codes: list[FanCode]) -> tuple[Floats, Floats]:
     corners = [
         points.position_m for points in (mission.detections, mission.truth, mission.poses) if points is not None and len(points)
     ]

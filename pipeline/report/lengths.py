@@ -1,0 +1,22 @@
+"""Lengths for people."""
+
+import math
+
+
+def nice_length(length: float) -> float:
+    """The largest 1, 2 or 5 times a power of ten that is not over `length`."""
+    power = 10.0 ** math.floor(math.log10(length))
+    return max(factor * power for factor in (1, 2, 5) if factor * power <= length * (1 + 1e-9))
+
+
+def metres(length_m: float) -> str:
+    """A length for people: three digits, in km from 1000 m on."""
+    if not math.isfinite(length_m):
+        return "unknown"
+    return (
+        f"{length_m / 1000:,.3g} km"
+        if 999.5 <= length_m < 999_500
+        else f"{length_m / 1000:,.0f} km"
+        if length_m >= 999_500
+        else f"{length_m:.3g} m"
+    )

@@ -1,0 +1,122 @@
+"""Small maps of chosen moments as SVG text, readable without scripts and on paper.
+
+Colours come from the style sheet's classes (see `page.css`), so that they follow light, dark and print.
+"""
+
+import math
+from html import escape
+
+import numpy as np
+
+from pipeline.report.analysis import FanShape
+from pipeline.report.lengths import metres, nice_length
+from pipeline.report.mission import Fan, Floats, Mission, Obstacle
+
+MAP_WIDTH, MAP_HEIGHT = 400, 300
+MAX_STATIC_HYPOTHESES = 40
+MAX_STATIC_POINTS = 250
+
+
+class View:
+    """From mission metres to the pixels of a small map: equal scales, north up."""
+
+    def __init__(self, position_m: Floats, margin: float = 0.08) -> None:
+        low, high = position_m.min(axis=0), position_m.max(axis=0)
+        size = np.maximum(high - low, max(float((high - low).max()) * 0.05, 1.0))
+        self.pixel_per_m = float(min(MAP_WIDTH / size[0], MAP_HEIGHT / size[1]) * (1 - 2 * margin))
+        self._centre_m = (low + high) / 2
+
+    def pixels(self, position_m: Floats) -> Floats:
+        """[..., 2] metres to [..., 2] pixels."""
+        shifted = (np.asarray(position_m, dtype=np.float64) - self._centre_m) * self.pixel_per_m
+        return np.asarray(shifted * (1, -1) + (MAP_WIDTH / 2, MAP_HEIGHT / 2))
+
+
+def moment_map(mission: Mission, fan: Fan, shape: FanShape, label: str) -> str:
+    """The map of one fan: obstacles, truth, hypotheses, mean, detections and the place at the origin."""
+    first_ns, last_ns = int(fan.time_ns[0]), int(fan.time_ns[-1])
+    detections = mission.detections.of(fan.agent).between(first_ns, last_ns)
+    track_m = fan.offset_m.astype(np.float64) + fan.datum_m
+    heaviest = np.argsort(-fan.weight, kind="stable")[:MAX_STATIC_HYPOTHESES]
+    # A single stray hypothesis must not shrink all others to a dot.
+    low, high = np.percentile(track_m.reshape(-1, 2), [1, 99], axis=0)
+    view = View(np.concatenate([low[None], high[None], shape.mean_m, detections.position_m]))
+    now = fan.origin_index
+    parts = [_obstacle(item, view) for item in mission.obstacles]
+    if mission.truth is not None:
+        truth = mission.truth.of(fan.agent).between(first_ns, last_ns)
+        parts.append(_line(view.pixels(truth.position_m), "truth"))
+    strongest = float(fan.weight.max())
+    base = min(0.8, max(0.16, 2.4 / math.sqrt(len(heaviest))))
+    for k in sorted(heaviest.tolist()):
+        opacity = max(0.05, base * float(fan.weight[k]) / strongest)
+        pixels = view.pixels(track_m[k])
+        parts.append(_line(pixels[: now + 1], "past", opacity))
+        parts.append(_line(pixels[now:], "future", opacity))
+    mean = view.pixels(shape.mean_m)
+    parts += [_line(mean[: now + 1], "past mean"), _line(mean[now:], "future mean")]
+    age = np.clip((fan.origin_ns - detections.time_ns) / max(fan.origin_ns - first_ns, 1), None, 1)
+    for (x, y), share in list(zip(view.pixels(detections.position_m), age, strict=True))[-MAX_STATIC_POINTS:]:
+        if share < 0:
+            parts.append(f'<circle class="later" cx="{x:.1f}" cy="{y:.1f}" r="3"/>')
+        else:
+            parts.append(f'<circle class="detection" cx="{x:.1f}" cy="{y:.1f}" r="3.2" fill-opacity="{1 - 0.75 * share:.2f}"/>')
+    parts.append(f'<circle class="now" cx="{mean[now][0]:.1f}" cy="{mean[now][1]:.1f}" r="6"/>')
+    parts += [scale_bar(view.pixel_per_m), NORTH_ARROW]
+    opening = f'<svg class="map" viewBox="0 0 {MAP_WIDTH} {MAP_HEIGHT}" role="img" aria-label="{escape(label)}">'
+    return f"{opening}{''.join(parts)}</svg>"
+
+
+NORTH_ARROW = (
+    f'<g class="furniture" transform="translate({MAP_WIDTH - 20} 26)"><path d="M0 -14 L5 2 L0 -2 L-5 2 Z"/>'
+    '<text y="15" text-anchor="middle">N</text></g>'
+)
+
+
+def scale_bar(pixel_per_m: float) -> str:
+    """A bar of a round length at the lower left."""
+    length_m = nice_length(MAP_WIDTH * 0.28 / pixel_per_m)
+    width = length_m * pixel_per_m
+    bottom = MAP_HEIGHT - 12
+    return (
+        f'<g class="furniture"><path class="bar" d="M12 {bottom - 5} v5 h{width:.1f} v-5"/>'
+        f'<text x="{12 + width / 2:.1f}" y="{bottom - 7}" text-anchor="middle">{metres(length_m)}</text></g>'
+    )
+
+
+def _line(pixels: Floats, kind: str, opacity: float | None = None) -> str:
+    if len(pixels) < 2:
+        return ""
+    kept = _simplify(pixels)
+    points = " ".join(f"{x:.1f},{y:.1f}" for x, y in kept)
+    faded = f' stroke-opacity="{opacity:.2f}"' if opacity is not None else ""
+    return f'<polyline class="{kind}" points="{points}"{faded}/>'
+
+
+def _simplify(pixels: Floats, tolerance: float = 0.4) -> Floats:
+    """Without the points that lie closer than `tolerance` pixels to the chord (Douglas and Peucker, 1973)."""
+    keep = np.zeros(len(pixels), dtype=bool)
+    keep[[0, -1]] = True
+    spans = [(0, len(pixels) - 1)]
+    while spans:
+        first, last = spans.pop()
+        if last - first < 2:
+            continue
+        chord = pixels[last] - pixels[first]
+        inner = pixels[first + 1 : last] - pixels[first]
+        along = np.clip(inner @ chord / max(float(chord @ chord), 1e-12), 0, 1)
+        distance = np.hypot(*(inner - along[:, None] * chord).T)
+        if distance.max() > tolerance:
+            middle = first + 1 + int(distance.argmax())
+            keep[middle] = True
+            spans += [(first, middle), (middle, last)]
+    return pixels[keep]
+
+
+def _obstacle(item: Obstacle, view: View) -> str:
+    title = f"<title>{escape(item.name)}</title>" if item.name else ""
+    if item.centre_m is not None:
+        x, y = view.pixels(np.array(item.centre_m))
+        return f'<circle class="obstacle" cx="{x:.1f}" cy="{y:.1f}" r="{item.radius_m * view.pixel_per_m:.1f}">{title}</circle>'
+    rings = [" L".join(f"{x:.1f} {y:.1f}" for x, y in _simplify(view.pixels(ring))) for ring in item.rings_m if len(ring)]
+    return f'<path class="obstacle" d="{" ".join(f"M{ring} Z" for ring in rings)}">{title}</path>'

@@ -1,0 +1,101 @@
+"""Sections on the hypotheses: chosen moments, uncertainty over time, windows that need attention."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from pipeline.report.analysis import Analysis, Moment, find_troubles, shape_of
+from pipeline.report.charts import SpreadAxis, TimeAxis, uncertainty_chart
+from pipeline.report.clock import Clock, duration
+from pipeline.report.lengths import metres
+from pipeline.report.maps import moment_map
+from pipeline.report.markup import label, legend, section, table, text
+from pipeline.report.mission import Mission
+
+MAX_TROUBLES = 100
+OPEN_CHART_ROWS, MAX_CHART_ROWS = 8, 60
+
+
+def moments_section(mission: Mission, analysis: Analysis, moments: Sequence[Moment]) -> str:
+    """Small maps, readable without scripts and on paper."""
+    if not mission.fans:
+        return section("Chosen moments", "<p>No window has hypotheses; the reasons are listed below.</p>")
+    if not moments:
+        return ""
+    clock = Clock(mission.start_ns, mission.end_ns)
+    ages = {(row.window, row.agent): row.age_s for row in mission.rows}
+    figures = []
+    for moment in moments:
+        fan = mission.fans[moment.fan]
+        age, error_m = ages.get((fan.window, fan.agent)), analysis.error_now_m[moment.fan]
+        words = [f"{mission.agents[fan.agent]} at {clock.moment(fan.origin_ns)}"]
+        words += [f"spread {metres(analysis.spread_now_m[moment.fan])}"]
+        words += [f"last seen {duration(age)} before"] if age is not None else []
+        words += [f"mean {metres(error_m)} from truth"] if np.isfinite(error_m) else []
+        drawing = moment_map(mission, fan, shape_of(fan), f"{moment.reason}. {', '.join(words)}")
+        place = f'data-seconds="{(fan.origin_ns - mission.start_ns) / 1e9:.3f}" data-agent="{fan.agent}"'
+        figures.append(
+            f"<figure>{drawing}<figcaption><strong>{text(moment.reason)}.</strong> {text(', '.join(words))}. "
+            f'<button type="button" class="only-script" {place}>On the map</button>'
+            "</figcaption></figure>"
+        )
+    lead = "Windows that deserve a look, one agent each. North is up; scales differ."
+    return section("Chosen moments", f'<div class="moments">{"".join(figures)}</div>', lead)
+
+
+def uncertainty_section(mission: Mission, analysis: Analysis) -> str:
+    """A chart row an agent; the widest first, most of them folded away where there are many."""
+    if not mission.fans:
+        return ""
+    agents, widest_m = _ranked_agents(mission, analysis)
+    axis, spread = TimeAxis(mission), SpreadAxis(analysis)
+    content = uncertainty_chart(mission, analysis, agents[:OPEN_CHART_ROWS], axis, spread)
+    rest = agents[OPEN_CHART_ROWS:MAX_CHART_ROWS]
+    if rest:
+        chart = uncertainty_chart(mission, analysis, rest, axis, spread)
+        content += f"<details><summary>{len(rest)} more agents</summary>{chart}</details>"
+    if len(agents) > MAX_CHART_ROWS:
+        content += f'<p class="note">{len(agents) - MAX_CHART_ROWS} more agents with a smaller spread are not drawn.</p>'
+    keys = (
+        ('<polyline class="past mean" points="0,8 26,8"/>', "spread at the origin"),
+        ('<polyline class="future mean solid" points="0,8 26,8"/>', "spread at the end of the horizon"),
+        ('<path class="tick" d="M13 3v10"/>', "detection"),
+        ('<rect class="void" x="3" y="2" width="20" height="12"/>', "windows without hypotheses"),
+    )
+    lead = "Spread is the root mean square distance of hypotheses from their mean, on a logarithmic scale shared by all agents."
+    if len(agents) > 1:
+        name = mission.agents[agents[0]]
+        lead += f" Agents are sorted by their median spread at the origin; {name} has the largest, {metres(widest_m)}."
+    return section("Uncertainty over time", content + legend(keys), lead)
+
+
+def _ranked_agents(mission: Mission, analysis: Analysis) -> tuple[list[int], float]:
+    """Agents with hypotheses by falling median spread at the origin, and the largest of these medians."""
+    owner = np.array([fan.agent for fan in mission.fans])
+    medians = {int(agent): float(np.median(analysis.spread_now_m[owner == agent])) for agent in np.unique(owner)}
+    ranked = sorted(medians, key=lambda agent: (-medians[agent], agent))
+    return ranked, medians[ranked[0]]
+
+
+def trouble_section(mission: Mission) -> str:
+    """Windows with a status other than ok, and what to do about them."""
+    troubles = find_troubles(mission)
+    if not troubles:
+        return section("Windows that need attention", "<p>None: every window of every agent has status ok.</p>")
+    clock = Clock(mission.start_ns, mission.end_ns)
+    rows = []
+    for trouble in troubles[:MAX_TROUBLES]:
+        ends = [trouble.first] if trouble.count == 1 else [trouble.first, trouble.last]
+        when, number = (
+            " to ".join(words) for words in zip(*((clock.moment(row.origin_ns), str(row.window)) for row in ends), strict=True)
+        )
+        cells = (mission.agents[trouble.agent], number, when)
+        rows.append([*map(text, cells), label(trouble.status), text(trouble.advice)])
+    content = table(["agent", "windows", "origin", "status", "what to do"], rows)
+    if len(troubles) > MAX_TROUBLES:
+        content += f'<p class="note">{len(troubles) - MAX_TROUBLES} more rows are in windows.parquet.</p>'
+    bad = sum(trouble.count for trouble in troubles)
+    lead = (
+        f"{bad:,} of {len(mission.rows):,} pairs of a window and an agent are not ok; a row is a run of windows of one agent."
+    )
+    return section("Windows that need attention", content, lead)
