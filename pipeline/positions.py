@@ -137,7 +137,7 @@ class ChannelReader:
             return FieldReader(())
         is_stated = getattr(self.source, PATH_KEYS.get(name, name), None) is not None
         is_position = name in ("x", "y", "latitude", "longitude") and self.source.preset is not None and self.is_stated
-        return FieldReader(paths, is_needed=is_stated or is_position)
+        return FieldReader(paths, is_needed=bool(paths) and (is_stated or is_position))
 
     def read(self, message: Any, raw: RawMessage) -> None:
         """Append the positions of one decoded message, or count why there are none."""

@@ -37,7 +37,7 @@ def stamp(time_s: float) -> dict[str, int]:
 def write_log(path: Path, rows: Iterable[Row]) -> Path:
     """Write an indexed MCAP."""
     with path.open("wb") as file:
-        writer = Writer(file)
+        writer = Writer(file, chunk_size=16_384)
         writer.start()
         channels: dict[tuple[str, str], int] = {}
         for sequence, row in enumerate(rows):
