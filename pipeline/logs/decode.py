@@ -6,20 +6,15 @@ repeated fields. `field` reads both kinds.
 
 import json
 import re
-import struct
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, Final
 
-from google.protobuf.message import DecodeError
-from mcap.exceptions import McapError
 from mcap.records import Schema
 from mcap_protobuf.decoder import DecoderFactory as ProtobufDecoderFactory
 from mcap_ros2.decoder import DecoderFactory as Ros2DecoderFactory
 from rosbags.interfaces.typing import Typesdict
-from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
-from rosbags.typesys.base import TypesysError
 from rosbags.typesys.store import Typestore
 
 from cadence.errors import InputError
@@ -27,12 +22,8 @@ from pipeline.logs.reader import Channel
 
 Decoder = Callable[[bytes], Any]
 
-_FOREIGN: Final = (
-    SerdeError, TypesysError, McapError, DecodeError, ValueError, TypeError, LookupError, ArithmeticError, AttributeError,
-    AssertionError, NameError, SyntaxError, RuntimeError, EOFError, OSError, MemoryError, struct.error,
-)  # fmt: skip
-"""What schema parsers, code generators and decoders raise on schemas and bytes that are not theirs."""
 _IDENTIFIER: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")
+_PLAIN_CDR: Final = (b"\x00\x00", b"\x00\x01")
 _MAX_REASON = 160
 _STAMPS: Final = {
     "builtin_interfaces/msg/Time": "int32 sec\nuint32 nanosec\n",
@@ -71,7 +62,7 @@ def decoder_for(channel: Channel) -> Decoder:
     def checked(data: bytes) -> Any:
         try:
             return decode(data)
-        except _FOREIGN as error:
+        except Exception as error:  # see `_named`
             reason = _reason(error)
             raise UndecodableMessage(f"{channel.topic}: a message does not fit its schema ({reason}); it is skipped") from error
 
@@ -99,9 +90,10 @@ def field(message: Any, path: str) -> Any:
 
 @contextmanager
 def _named(channel: Channel, kind: type[InputError], what: str) -> Iterator[None]:
+    """Foreign schema parsers, code generators and decoders raise whatever they like on bytes that are not theirs."""
     try:
         yield
-    except _FOREIGN as error:
+    except Exception as error:
         name = channel.schema_name or "no schema"
         raise kind(f"{channel.topic}: {what} ({name}, {channel.message_encoding}): {_reason(error)}") from error
 
@@ -123,21 +115,19 @@ def _protobuf_decoder(channel: Channel) -> Decoder:
 
 
 def _cdr_decoder(channel: Channel) -> Decoder:
-    """By rosbags, twice as fast as mcap_ros2; that one reads some schemas which rosbags refuses, and parameter lists."""
+    """By rosbags, twice as fast as mcap_ros2; that one reads some schemas which rosbags refuses."""
     try:
-        decode = _rosbags_cdr_decoder(channel)
-    except _FOREIGN:
-        return _mcap_ros2_decoder(channel)
-    fallback: list[Decoder] = []
+        return _rosbags_cdr_decoder(channel)
+    except Exception:  # the other one says what is wrong where it cannot either
+        decode = _mcap_ros2_decoder(channel)
 
-    def decode_any(data: bytes) -> Any:
-        if data[:2] in (b"\x00\x00", b"\x00\x01"):
-            return decode(data)
-        if not fallback:
-            fallback.append(_mcap_ros2_decoder(channel))
-        return fallback[0](data)
+    def decode_plain(data: bytes) -> Any:
+        # mcap_ros2 would read other encapsulations as if they were plain CDR: better no position than a wrong one.
+        if data[:2] not in _PLAIN_CDR:
+            raise ValueError(f"CDR encapsulation {data[:2].hex()} is not known")
+        return decode(data)
 
-    return decode_any
+    return decode_plain
 
 
 def _rosbags_cdr_decoder(channel: Channel) -> Decoder:
