@@ -56,10 +56,12 @@ class Plan:
     reached_end: bool = False
     has_checksums: bool = True
 
-    @property
-    def num_messages(self) -> int:
-        """Messages in the blocks, also those of channels without definition."""
-        return sum(sum(block.num_messages.values()) for block in self.blocks)
+    def counts(self) -> Counter[int]:
+        """Messages in the blocks by channel id, also those of channels without definition."""
+        counts: Counter[int] = Counter()
+        for block in self.blocks:
+            counts.update(block.num_messages)
+        return counts
 
 
 @dataclass

@@ -180,9 +180,7 @@ def _check_magic(path: Path) -> int:
 
 
 def _channels(plan: Plan) -> tuple[Channel, ...]:
-    counts: Counter[int] = Counter()
-    for block in plan.blocks:
-        counts.update(block.num_messages)
+    counts = plan.counts()
     channels = []
     for number, record in sorted(plan.channels.items()):
         schema = plan.schemas.get(record.schema_id)
@@ -193,8 +191,9 @@ def _channels(plan: Plan) -> tuple[Channel, ...]:
 
 
 def _health(plan: Plan, known: set[int]) -> Health:
-    found = plan.num_messages
-    lost = _orphans(plan, known)
+    counts = plan.counts()
+    found = counts.total()
+    lost = {number: count for number, count in counts.items() if number not in known}
     readable = found - sum(lost.values())
     statistics = plan.summary.statistics if plan.summary else None
     expected = statistics.message_count if statistics else None
@@ -214,15 +213,15 @@ def _health(plan: Plan, known: set[int]) -> Health:
     if expected is not None and expected != readable:
         is_complete = False
         problems.append(f"The file should hold {expected} messages; {readable} can be read.")
+    elif (
+        statistics is not None
+        and statistics.channel_message_counts
+        and plan.counts() != +Counter(statistics.channel_message_counts)
+    ):
+        is_complete = False
+        problems.append("The numbers of messages of single channels differ from the statistics of the file.")
     spans = tuple(sorted({loss.span_ns for loss in plan.losses if loss.span_ns is not None}))
     return Health(is_complete, (*problems, *plan.remarks), readable, expected, spans, plan.has_checksums)
-
-
-def _orphans(plan: Plan, known: set[int]) -> Counter[int]:
-    lost: Counter[int] = Counter()
-    for block in plan.blocks:
-        lost.update({number: count for number, count in block.num_messages.items() if number not in known})
-    return lost
 
 
 def _sentence(loss: Loss) -> str:

@@ -97,13 +97,13 @@ def parse_chunk(body: bytes) -> records.Chunk:
     return chunk
 
 
-def index_count(body: bytes) -> tuple[int, int]:
-    """Channel id and number of messages in the MessageIndex record with this body."""
+def parse_message_index(body: bytes) -> tuple[int, list[tuple[int, int]]]:
+    """Channel id, and (log time, offset inside the chunk) of its messages, from the MessageIndex record with this body."""
     with damage():
         channel_id, length = struct.unpack_from("<HI", body)
     if length != len(body) - 6 or length % 16:
         raise DamagedRecord("the lengths in a message index contradict each other")
-    return channel_id, length // 16
+    return channel_id, list(struct.iter_unpack("<QQ", body[6:]))
 
 
 def unpack_chunk(chunk: records.Chunk) -> bytes:

@@ -27,10 +27,10 @@ from pipeline.logs.records import (
     DamagedRecord,
     StrictStream,
     damage,
-    index_count,
     is_chunk_head,
     parse_channel,
     parse_chunk,
+    parse_message_index,
     parse_metadata,
     parse_schema,
     unpack_chunk,
@@ -70,6 +70,7 @@ class _Scanner:
         self.loose = LooseRun()
         self.previous = 0  # opcode of the record before: a message index follows a chunk or another one
         self.broken_chunk: int | None = None  # index of the loss of the chunk just before, to be counted by its indexes
+        self.unchecked: dict[int, list[tuple[int, int]]] | None = None  # messages of the chunk just before, without a CRC
         self.num_unknown = self.num_timeless = 0
         self.definitions: set[bytes] = set()
         self.chunks: set[int] = set()
@@ -110,7 +111,7 @@ class _Scanner:
         if opcode == 0 or end > self.limit:
             raise DamagedRecord("the file ends inside a record" if opcode else "there is no such record")
         if opcode != Opcode.MESSAGE_INDEX:
-            self.broken_chunk = None
+            self.broken_chunk = self.unchecked = None
         body = self._take(opcode, offset + HEAD.size, length)
         if not self.plan.reached_end:
             self.crc = zlib.crc32(head, self.crc)
@@ -169,11 +170,7 @@ class _Scanner:
         if opcode == Opcode.MESSAGE_INDEX:
             if self.previous not in (Opcode.CHUNK, Opcode.MESSAGE_INDEX):
                 self.plan.doubts.append(f"At byte {offset}: a message index without the chunk that it belongs to.")
-            _, count = index_count(body)
-            if self.broken_chunk is not None:
-                loss = self.plan.losses[self.broken_chunk]
-                known = (loss.num_messages or 0) + count
-                self.plan.losses[self.broken_chunk] = Loss(loss.offset, loss.reason, loss.span_ns, known)
+            self._compare_index(offset, *parse_message_index(body))
         elif opcode == Opcode.METADATA:
             parse_metadata(body)
             self.plan.metadata_spans.append((offset, len(body)))
@@ -181,11 +178,23 @@ class _Scanner:
             self.plan.library = _library(body)
         return body
 
+    def _compare_index(self, offset: int, channel_id: int, entries: list[tuple[int, int]]) -> None:
+        """Count what a broken chunk held, or check the times in a chunk that has no checksum."""
+        if self.broken_chunk is not None:
+            loss = self.plan.losses[self.broken_chunk]
+            known = (loss.num_messages or 0) + len(entries)
+            self.plan.losses[self.broken_chunk] = Loss(loss.offset, loss.reason, loss.span_ns, known)
+        elif self.unchecked is not None and sorted(self.unchecked.get(channel_id, ())) != sorted(entries):
+            where = f"At byte {offset}: the messages of a chunk without checksum differ from their index"
+            self.plan.doubts.append(f"{where}; times of channel {channel_id} may be wrong.")
+
     def _take_chunk(self, offset: int, body: bytes) -> None:
         chunk = parse_chunk(body)
         self.chunks.add(offset - HEAD.size)
+        self.unchecked = None
         if not chunk.uncompressed_crc:
             self.plan.has_checksums = False
+            self.unchecked = {}
         try:
             block = self._block_of_chunk(offset, len(body), unpack_chunk(chunk))
         except DamagedRecord as error:
@@ -237,6 +246,8 @@ class _Scanner:
                 is_sorted = is_sorted and log_time >= previous
                 previous = log_time
                 first, last = min(first, log_time), max(last, log_time)
+                if self.unchecked is not None:
+                    self.unchecked.setdefault(channel_id, []).append((log_time, begin - HEAD.size))
             elif opcode in (Opcode.CHANNEL, Opcode.SCHEMA):
                 definitions.append((opcode, data[begin:end]))
         for opcode, body in definitions:  # only now: a chunk whose end is broken must not leave half of itself behind

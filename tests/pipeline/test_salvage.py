@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from mcap.records import ChunkIndex
 from mcap.stream_reader import StreamReader
-from mcap.writer import Writer
+from mcap.writer import CompressionType, IndexType, Writer
 from recorder_fixture import FORMS, NUM_MESSAGES, START_NS, content, recording, reference
 
 from cadence.errors import InputError
@@ -193,6 +193,35 @@ def test_changed_topic_outside_chunks_is_noticed_and_the_index_wins(scratch):
     damaged[damaged.index(b"/b")] ^= 1
     health, messages = read(scratch, bytes(damaged))
     assert messages == MESSAGES["unchunked"] and not health.is_complete
+
+
+def test_changed_times_and_channels_in_chunks_without_checksum_are_noticed(scratch):
+    """Most recorders of ROS 2 write no checksums; their indexes and statistics still tell."""
+    whole = recording(compression=CompressionType.NONE, enable_crcs=False)
+    health, messages = read(scratch, whole)
+    assert health.is_complete and not health.problems and not health.has_checksums
+    start = whole.index(record_head(70))
+    for offset, words in ((start + 9 + 8, "times of channel"), (start + 9, "may be wrong")):
+        damaged = bytearray(whole)
+        damaged[offset] ^= 3
+        health, found = read(scratch, bytes(damaged))
+        assert found != messages and not health.is_complete and words in " ".join(health.problems)
+
+
+def test_changed_channel_without_message_index_is_noticed_by_the_statistics(scratch):
+    whole = recording(compression=CompressionType.NONE, enable_crcs=False, index_types=IndexType.NONE)
+    damaged = bytearray(whole)
+    damaged[whole.index(record_head(70)) + 9] ^= 3
+    health, _ = read(scratch, bytes(damaged))
+    assert not health.is_complete and "statistics" in health.problems[0]
+
+
+def record_head(number: int) -> bytes:
+    """Where message `number` of a recording begins, up to its channel id."""
+    body = b'{"x": %d, "noise": "' % number
+    whole = recording(compression=CompressionType.NONE, enable_crcs=False)
+    begin = whole.index(body) - 22 - 9
+    return whole[begin : begin + 9 + 6]
 
 
 def test_times_beyond_int64_are_left_out_and_counted(scratch):
