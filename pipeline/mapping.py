@@ -8,7 +8,7 @@ import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Literal
+from typing import Final, Literal
 
 from pipeline.presets import normalise_schema, preset_for
 from pipeline.sources import ChannelLike, SourceConfig
@@ -25,6 +25,7 @@ _POSE = {
     "pose", "poses", "odom", "odometry", "fix", "gps", "gnss", "navsat", "location", "position", "tracker", "trackers",
     "sensor", "sensors", "ownship", "own", "ego", "platform", "platforms", "observer", "observers",
 }  # fmt: skip
+_KNOWN: Final = _TRUTH | _DETECTION | _POSE | {"ground"}
 _OBSTACLE = {"obstacle", "obstacles", "map", "costmap", "grid", "keepout", "nogo"}
 _TF_SCHEMAS = {"TFMessage", "FrameTransform", "FrameTransforms"}
 _OBSTACLE_SCHEMAS = {"OccupancyGrid", "Grid", "GeoJSON"}
@@ -67,17 +68,17 @@ def suggest_mapping(channels: Sequence[ChannelLike]) -> SuggestedMapping:
 
     return SuggestedMapping(
         roles,
-        detections=_name_only_agent(_sources(readable("detections"), "agent"), readable("detections"), readable("truth")),
-        truth=_sources(readable("truth"), "agent"),
-        poses=_sources(readable("poses"), "sensor"),
-        positions=_sources(readable("positions"), "agent"),
+        detections=_name_only_agent(_sources(readable("detections"), "detections"), readable("detections"), readable("truth")),
+        truth=_sources(readable("truth"), "truth"),
+        poses=_sources(readable("poses"), "poses"),
+        positions=_sources(readable("positions"), "positions"),
     )
 
 
 def dense_sources(channels: Sequence[ChannelLike], suggested: SuggestedMapping) -> tuple[SourceConfig, ...]:
     """Poses and positions as sources of truth, for a log whose only position channel is the one to thin."""
     usable = [c for c in channels if suggested.roles.get(c.topic) in ("poses", "positions") and preset_for(c.schema_name)]
-    return _sources([c for c in usable if c.message_count != 0], "agent")
+    return _sources([c for c in usable if c.message_count != 0], "truth")
 
 
 def describe_channels(channels: Iterable[ChannelLike]) -> str:
@@ -111,27 +112,55 @@ def _role(channel: ChannelLike) -> Role | None:
     return "poses" if _POSE.intersection(words) else "positions"
 
 
-def _sources(channels: Sequence[ChannelLike], placeholder: Literal["agent", "sensor"]) -> tuple[SourceConfig, ...]:
-    """One source a pattern: topics of one preset that differ in one part of their names share it."""
-    found = {(_pattern(c.topic, placeholder), preset_for(c.schema_name)): None for c in channels}
+def _sources(channels: Sequence[ChannelLike], role: Role) -> tuple[SourceConfig, ...]:
+    """One source a pattern: topics of one preset that differ only in a name share it."""
+    topics = [channel.topic for channel in channels]
+    found = {(_pattern(c.topic, role, topics), preset_for(c.schema_name)): None for c in channels}
     return tuple(SourceConfig(pattern, preset=preset) for pattern, preset in found)
 
 
-def _pattern(topic: str, placeholder: str) -> str:
-    """Put the placeholder where a name stands beside words of roles: /truth/A7 → /truth/{agent}, /cub1/pose → /{agent}/pose."""
+def _pattern(topic: str, role: Role, topics: Sequence[str]) -> str:
+    """Put placeholders where names stand beside words of roles.
+
+    /truth/A7 → /truth/{agent}, /cub1/pose → /{agent}/pose; of a detection the name before the word is who sees, the name
+    after it who is seen: /camera/contacts/A7 → /{sensor}/contacts/{agent}. Names in `topics` tell which part varies.
+    """
     parts = topic.split("/")
-    known = _TRUTH | _DETECTION | _POSE | {"ground"}
-    free = [i for i, part in enumerate(parts) if part and not known.intersection(_words(part))]
-    if len(free) != 1 or len(list(filter(None, parts))) < 2:
+    is_word = [bool(part) and not _KNOWN.isdisjoint(_words(part)) for part in parts]
+    names = [i for i, part in enumerate(parts) if part and not is_word[i]]
+    if not any(is_word) or not names:
         return topic
-    return "/".join(f"{{{placeholder}}}" if i == free[0] else part for i, part in enumerate(parts))
+    varying = _varying(parts, names, topics)
+    if role == "detections":
+        word = max(i for i, known in enumerate(is_word) if known)
+        for placeholder, places in (("sensor", [i for i in names if i < word]), ("agent", [i for i in names if i > word])):
+            if places:
+                parts[next((i for i in reversed(places) if i in varying), places[-1])] = f"{{{placeholder}}}"
+    else:
+        parts[varying[-1] if varying else names[-1]] = "{sensor}" if role == "poses" else "{agent}"
+    return "/".join(parts)
+
+
+def _varying(parts: Sequence[str], names: Sequence[int], topics: Sequence[str]) -> list[int]:
+    """The places of `names` in which some other topic differs from this one, and in no other part."""
+    found: set[int] = set()
+    for other in (topic.split("/") for topic in topics):
+        if len(other) == len(parts):
+            different = [i for i, (mine, its) in enumerate(zip(parts, other, strict=True)) if mine != its]
+            found.update(different if len(different) == 1 else ())
+    return [i for i in names if i in found]
 
 
 def _name_only_agent(
     detections: tuple[SourceConfig, ...], channels: Sequence[ChannelLike], truth: Sequence[ChannelLike]
 ) -> tuple[SourceConfig, ...]:
     """Detections without identity are of the only agent that the log's truth knows, where that is only one."""
-    named = [found["agent"] for source in _sources(truth, "agent") for c in truth if (found := source.match(c.topic))]
+    named = [
+        found.get("agent", c.topic.strip("/"))
+        for source in _sources(truth, "truth")
+        for c in truth
+        if (found := source.match(c.topic))
+    ]
     if len(truth) != 1 or len(named) != 1:
         return detections
     identified = {c.topic for c in channels if b"agent_id" in c.schema_data or preset_for(c.schema_name) == "Detection3DArray"}

@@ -57,6 +57,32 @@ def test_topics_of_one_pattern_become_one_source() -> None:
     assert found.poses == (SourceConfig("/trackers/{sensor}", preset="LocationFix"),)
 
 
+@pytest.mark.parametrize(
+    ("topics", "patterns"),
+    [
+        (["/camera1/detections", "/camera2/detections"], ["/{sensor}/detections"]),
+        (["/camera1/contacts/A7"], ["/{sensor}/contacts/{agent}"]),
+        (["/uav1/front/contacts", "/uav2/front/contacts"], ["/{sensor}/front/contacts"]),
+        (["/contacts"], ["/contacts"]),
+    ],
+)
+def test_who_sees_stands_before_the_word_and_who_is_seen_after_it(topics: list[str], patterns: list[str]) -> None:
+    assert [source.topic for source in suggest(*((topic, FIX) for topic in topics)).detections] == patterns
+
+
+@pytest.mark.parametrize(
+    ("topics", "patterns"),
+    [
+        (["/vrpn/uav1/truth"], ["/vrpn/{agent}/truth"]),
+        (["/uav1/base/truth", "/uav2/base/truth"], ["/{agent}/base/truth"]),
+        (["/uav1/ground_truth/odom"], ["/{agent}/ground_truth/odom"]),
+        (["/truth"], ["/truth"]),
+    ],
+)
+def test_the_part_that_varies_is_the_agent(topics: list[str], patterns: list[str]) -> None:
+    assert [source.topic for source in suggest(*((topic, FIX) for topic in topics)).truth] == patterns
+
+
 def test_detections_without_identity_stay_unknown_among_several_agents() -> None:
     assert suggest(("/truth/A", FIX), ("/truth/B", FIX), ("/contacts", FIX)).detections[0].agent is None
 
