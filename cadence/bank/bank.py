@@ -1,0 +1,222 @@
+"""The bank of motion models: weights by expectation maximisation, posterior mixtures, joint samples.
+
+Every model gives a Gaussian posterior over the whole window given the detections; the window's posterior is their mixture,
+weighted by prior weight times likelihood. The prior weights, the speed unit and so the meaning of every model are learned
+from all detections of a log (empirical Bayes), without any truth.
+"""
+
+import dataclasses
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from cadence.bank.components import MotionModels, concatenate, default_models
+from cadence.bank.fitting import DIFFUSE_STEPS, FLOOR_STEPS, fit_ornstein_uhlenbeck, log_likelihood, with_floor
+from cadence.bank.mixture import (
+    MAX_MODELS,
+    MIN_WEIGHT,
+    Chosen,
+    at_node,
+    choose_models,
+    merge_grid,
+    mixture_moments,
+    random_numbers,
+)
+from cadence.bank.rows import active_rows, scatter_hypotheses, track_rows
+from cadence.bank.smoother import Nodes, backward_kernel, draw, filter_forward, smooth
+from cadence.bank.switching import SwitchingModels, continue_moments, continue_samples, durations_after
+from cadence.types import Detections, HypothesisSet, WindowBatch
+
+_NUM_EM_ROUNDS = 30
+_MAX_PAIRS = 1024
+
+
+@dataclass(frozen=True, eq=False)
+class BankPosterior:
+    """What the bank says of R rows (active agents of windows) on a grid of T steps.
+
+    mean_m   [R, T, 2] mean of the mixture
+    sigma_m  [R, T] root mean variance of an axis, never below a thousandth of a step length
+    sample_m [R, K, T, 2] joint samples
+    """
+
+    mean_m: Tensor
+    sigma_m: Tensor
+    sample_m: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class Bank:
+    """A weighted bank and the units of one log.
+
+    models       C motion models in units of steps and step lengths
+    log_weight   [C] log of the prior weights; equal where None
+    later_weight [C] weights of the models that take over after the last detection; the prior weights where None
+    speed_mps    the log's typical speed: one step length is speed_mps * step_s; None until fitted
+    switch_rate  how often, per step, the model changes after the last detection
+    temper       exponent of the likelihood when models are weighed: below one, as every model is wrong a little
+    pseudo_count how many stretches' worth of evidence the flat prior over models holds against the log
+    """
+
+    models: MotionModels = dataclasses.field(default_factory=default_models)
+    log_weight: Tensor | None = None
+    later_weight: Tensor | None = None
+    speed_mps: float | None = None
+    switch_rate: float = 1.0 / 32.0
+    temper: float = 0.3
+    pseudo_count: float = 3.0
+    name: str = "bank"
+
+    def fit(self, tracks: Detections, step_s: float | None = None) -> "Bank":
+        """The bank with speed unit and weights learned from the stretches of detections `tracks` [B, 1, N].
+
+        The Ornstein-Uhlenbeck model of greatest likelihood joins the bank as its last model.
+
+        Args:
+            tracks: one stretch a row; rows of about a window's length let the weights tell windows apart.
+            step_s: step of the windows to come; by default a sixteenth of the mean stretch.
+        """
+        rows = track_rows(tracks)
+        step_s = step_s or _default_step(rows)
+        speed_mps = typical_speed(rows, step_s)
+        rows = rows[rows.is_observed.sum(-1) > 1]
+        if len(rows.time_s) == 0:
+            return dataclasses.replace(self, speed_mps=speed_mps)
+        models = concatenate(self.models, fit_ornstein_uhlenbeck(rows, step_s, speed_mps))
+        log_weight, evidence = em_weights(log_likelihood(models, rows, step_s, speed_mps), self.pseudo_count)
+        return dataclasses.replace(self, models=models, log_weight=log_weight, later_weight=evidence, speed_mps=speed_mps)
+
+    def posterior(self, windows: WindowBatch, num_hypotheses: int) -> BankPosterior:
+        """Moments and joint samples for the active agents of `windows`, rows in the order of `is_active.nonzero()`."""
+        rows, seeds = active_rows(windows)
+        floor_m = FLOOR_STEPS * self._speed() * windows.step_s
+        evidence = log_likelihood(self.models, rows, windows.step_s, self._speed())
+        log_posterior = self.temper * evidence + self._log_weight()
+        parts = []
+        nodes = with_floor(rows, floor_m)
+        chunk = max(1, _MAX_PAIRS // MAX_MODELS)
+        for begin in range(0, len(rows.time_s), chunk):
+            part = torch.arange(begin, min(begin + chunk, len(rows.time_s)))
+            parts.append(self._posterior_rows(nodes[part], log_posterior[part], seeds[part], windows, num_hypotheses))
+        if not parts:
+            empty = torch.zeros(0, windows.num_steps, 2, dtype=torch.float64)
+            return BankPosterior(
+                empty, empty[..., 0], torch.zeros(0, num_hypotheses, windows.num_steps, 2, dtype=torch.float64)
+            )
+        mean, sigma, sample = (torch.cat(columns) for columns in zip(*parts, strict=True))
+        return BankPosterior(mean, sigma.clamp_min(floor_m), sample)
+
+    def sample(self, windows: WindowBatch, num_hypotheses: int) -> HypothesisSet:
+        """Joint samples of the bank itself: the rival and release gate of the diffusion model."""
+        return scatter_hypotheses(self.posterior(windows, num_hypotheses).sample_m, windows)
+
+    def _speed(self) -> float:
+        if self.speed_mps is None:
+            raise ValueError("Bank: fit() it to the detections of a log first; it has no speed unit")
+        return self.speed_mps
+
+    def _log_weight(self) -> Tensor:
+        if self.log_weight is None:
+            return torch.full((len(self.models),), -math.log(len(self.models)), dtype=torch.float64)
+        return self.log_weight
+
+    def _models_after(self, chosen: Chosen) -> tuple[Tensor, Tensor, Tensor]:
+        """Models at work after the last detection [C'], where each pair's model stands among them, and their weights."""
+        weight = self._log_weight().exp() if self.later_weight is None else self.later_weight
+        takes_part = weight > 0
+        takes_part[chosen.model] = True
+        index = takes_part.cumsum(0) - 1
+        return takes_part.nonzero()[:, 0], index[chosen.model], weight[takes_part]
+
+    def _posterior_rows(
+        self, rows: Nodes, log_posterior: Tensor, seeds: Tensor, windows: WindowBatch, num_hypotheses: int
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        chosen = choose_models(log_posterior)
+        nodes, step_index = merge_grid(rows, windows.time_s)
+        models = self.models.scaled(windows.step_s, self._speed())
+        diffuse = torch.full((len(chosen.row),), DIFFUSE_STEPS * self._speed() * windows.step_s, dtype=torch.float64)
+        filtered = filter_forward(models[chosen.model], nodes[chosen.row], diffuse)
+        backward = backward_kernel(filtered)
+        node_mean, node_covariance = smooth(filtered, backward)
+        pick = step_index[chosen.row]
+        mean = node_mean[..., :2].gather(1, pick[..., None].expand(-1, -1, 2))
+        variance = (0.5 * (node_covariance[..., 0, 0] + node_covariance[..., 1, 1])).gather(1, pick)
+        mean, variance = mixture_moments(mean, variance, chosen)
+        numbers = random_numbers(chosen.weight, rows, seeds, num_hypotheses, nodes.time_s.shape[1], windows.num_steps)
+        pair = chosen.first_pair[:, None] + numbers.owner
+        state = draw(backward, pair.flatten(), numbers.normal.flatten(0, 1)).view(len(mean), num_hypotheses, -1, 4)
+        sample = state[..., :2].gather(2, step_index[:, None, :, None].expand(-1, num_hypotheses, -1, 2))
+        if self.switch_rate == 0.0:
+            return mean, variance.sqrt(), sample
+        # only models that carry weight take part after the last detection
+        taking_part, chosen_index, later = self._models_after(chosen)
+        switching = SwitchingModels(models[taking_part], later, self.switch_rate / windows.step_s)
+        last_s = torch.where(rows.is_observed, rows.time_s, rows.time_s[:, :1]).amax(1)
+        durations = durations_after(windows.time_s.double(), last_s)
+        begin = int((durations > 0).any(0).to(torch.int64).argmax()) if (durations > 0).any() else windows.num_steps
+        is_after = (durations > 0)[:, begin:]
+        node = (nodes.is_observed * torch.arange(1, nodes.time_s.shape[1] + 1)).argmax(1)
+        last_mean, last_covariance, weight = at_node(filtered, chosen, chosen_index, node, len(taking_part))
+        later_mean, later_variance = continue_moments(switching, durations[:, begin:], weight, last_mean, last_covariance)
+        last_state = state[torch.arange(len(node))[:, None], torch.arange(num_hypotheses), node[:, None]]
+        later = continue_samples(
+            switching,
+            durations[:, begin:],
+            chosen_index[pair],
+            last_state,
+            numbers.uniform[:, :, begin:],
+            numbers.kick[:, :, begin:],
+        )
+        mean[:, begin:] = torch.where(is_after[..., None], later_mean, mean[:, begin:])
+        variance[:, begin:] = torch.where(is_after, later_variance, variance[:, begin:])
+        sample[:, :, begin:] = torch.where(is_after[:, None, :, None], later, sample[:, :, begin:])
+        return mean, variance.sqrt(), sample
+
+
+def em_weights(log_likelihood: Tensor, pseudo_count: float) -> tuple[Tensor, Tensor]:
+    """Mixture weights of greatest likelihood over all rows: log weights shrunk towards equal ones, and the bare evidence.
+
+    Args:
+        log_likelihood: [R, C].
+        pseudo_count: total weight of the flat Dirichlet prior, in rows.
+
+    Returns:
+        Log weights [C], and weights [C] without the prior's share (models of under half a per cent left out).
+    """
+    num_rows, num_models = log_likelihood.shape
+    log_weight = torch.full((num_models,), -math.log(num_models), dtype=torch.float64)
+    for _ in range(_NUM_EM_ROUNDS):
+        responsibility = torch.softmax(log_likelihood + log_weight, dim=1).sum(0)
+        log_weight = ((responsibility + pseudo_count / num_models) / (num_rows + pseudo_count)).log()
+    evidence = torch.where(responsibility >= MIN_WEIGHT * num_rows, responsibility, torch.zeros_like(responsibility))
+    return log_weight, evidence / evidence.sum()
+
+
+def typical_speed(rows: Nodes, step_s: float) -> float:
+    """Root mean square speed between successive detections, measurement noise taken off; never zero.
+
+    Pairs closer than a quarter of a step are left out: there noise divided by time would rule.
+    """
+    duration = torch.diff(rows.time_s, dim=1)
+    is_pair = rows.is_observed[:, 1:] & rows.is_observed[:, :-1] & (duration > 0.25 * step_s)
+    noise = rows.covariance_m2.diagonal(dim1=-2, dim2=-1).sum(-1)
+    square = (torch.diff(rows.position_m, dim=1) ** 2).sum(-1) - noise[:, 1:] - noise[:, :-1]
+    mean_noise = float(noise[rows.is_observed].mean()) if rows.is_observed.any() else 0.0
+    floor_mps = max(0.05 * math.sqrt(mean_noise) / step_s, 1e-6)
+    if not is_pair.any():
+        return max(floor_mps, 1.0 / step_s)
+    speed_square = (square / duration.clamp_min(1e-9) ** 2)[is_pair].clamp_min(0.0)
+    weight = duration[is_pair].clamp(max=8.0 * step_s)
+    # false positions make absurd speeds: cap at the speed below which the target spends 98 % of the time
+    ordered, order = speed_square.sort()
+    share = weight[order].cumsum(0) / weight.sum()
+    cap = ordered[int(torch.searchsorted(share, torch.tensor(0.98, dtype=share.dtype)).clamp(max=len(ordered) - 1))]
+    mean_square = float((weight * speed_square.clamp(max=cap)).sum() / weight.sum())
+    return max(math.sqrt(mean_square), floor_mps)
+
+
+def _default_step(rows: Nodes) -> float:
+    length = rows.time_s.amax(1) - rows.time_s[:, 0]
+    return max(float(length.mean()) / 16.0, 1e-3)

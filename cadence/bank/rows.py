@@ -1,0 +1,44 @@
+"""Windows and tracks as rows, one agent a row, and rows back as joint hypotheses."""
+
+import math
+
+import torch
+from torch import Tensor
+
+from cadence.bank.smoother import Nodes
+from cadence.types import Detections, HypothesisSet, WindowBatch
+
+
+def active_rows(windows: WindowBatch) -> tuple[Nodes, Tensor]:
+    """The detections of every active agent as rows [R, N], float64, and a seed a row."""
+    active = windows.is_active
+    detections = windows.detections
+    num_used = int(detections.count.max()) if active.any() else 1
+    columns = [
+        value[active][:, :num_used]
+        for value in (detections.time_s, detections.position_m, detections.covariance_m2, detections.is_observed)
+    ]
+    times, observed = columns[0].double(), columns[3]
+    # padding repeats the last detection's time, so that time never runs backwards
+    times = torch.where(observed, times, torch.full_like(times, -math.inf)).cummax(dim=1).values
+    agent = torch.arange(windows.num_agents).expand(active.shape)
+    seeds = (windows.seeds[:, None] * 1_000_003 + agent * 7_919)[active] % (2**62)
+    return Nodes(times, columns[1].double(), columns[2].double(), observed), seeds
+
+
+def scatter_hypotheses(sample_m: Tensor, windows: WindowBatch) -> HypothesisSet:
+    """Equally weighted hypotheses [B, K, A, T, 2] from the rows [R, K, T, 2] of the active agents."""
+    active = windows.is_active
+    b, a = active.shape
+    k, t = sample_m.shape[1:3]
+    position = torch.full((b, a, k, t, 2), math.nan, dtype=sample_m.dtype)
+    position[active] = sample_m
+    status = tuple(tuple("ok" if flag else "no_detections" for flag in row) for row in active.tolist())
+    return HypothesisSet(position.transpose(1, 2), torch.full((b, k), 1.0 / k, dtype=sample_m.dtype), status)
+
+
+def track_rows(tracks: Detections) -> Nodes:
+    """Stretches of detections [B, 1, N] as rows [R, N] (stretches without any left out)."""
+    seeds = torch.zeros(len(tracks.time_s), dtype=torch.int64)
+    rows, _ = active_rows(WindowBatch(torch.zeros(1), tracks, seeds, 0))
+    return rows
