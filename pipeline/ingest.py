@@ -145,7 +145,7 @@ def _is_of_other_path(directory: Path, log: Path) -> bool:
 
 
 def _survey(path: Path, progress: Progress) -> Catalogue:
-    with progress.bar(None, f"check {path.name}", unit="B", scale=True) as bar:
+    with progress.bar(path.stat().st_size, f"check {path.name}", unit="B", scale=True) as bar:
         log = open_log(path, bar.update)
     if log.health.num_messages == 0:
         why = log.health.problems[0] if log.health.problems else "nothing was recorded"

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from mcap.opcode import Opcode
+from mcap.records import Statistics
 
 from cadence.errors import InputError
 from pipeline.logs.plan import Block, Loss, Plan
@@ -210,18 +211,21 @@ def _health(plan: Plan, known: set[int]) -> Health:
     for number, channel in sorted(plan.channels.items()):
         if channel.schema_id and channel.schema_id not in plan.schemas:
             problems.append(f"Channel {number} ({channel.topic}) names schema {channel.schema_id}, which is not in the file.")
-    if expected is not None and expected != readable:
+    disagreement = _disagreement(counts, readable, expected, statistics)
+    if disagreement:
         is_complete = False
-        problems.append(f"The file should hold {expected} messages; {readable} can be read.")
-    elif (
-        statistics is not None
-        and statistics.channel_message_counts
-        and plan.counts() != +Counter(statistics.channel_message_counts)
-    ):
-        is_complete = False
-        problems.append("The numbers of messages of single channels differ from the statistics of the file.")
+        problems.append(disagreement)
     spans = tuple(sorted({loss.span_ns for loss in plan.losses if loss.span_ns is not None}))
     return Health(is_complete, (*problems, *plan.remarks), readable, expected, spans, plan.has_checksums)
+
+
+def _disagreement(counts: Counter[int], readable: int, expected: int | None, statistics: Statistics | None) -> str:
+    """How the messages that were found differ from what the file says of itself; empty where they agree."""
+    if expected is not None and expected != readable:
+        return f"The file should hold {expected} messages; {readable} can be read."
+    if statistics is not None and statistics.channel_message_counts and +Counter(statistics.channel_message_counts) != +counts:
+        return "The numbers of messages of single channels differ from the statistics of the file."
+    return ""
 
 
 def _sentence(loss: Loss) -> str:
