@@ -1,8 +1,9 @@
 """Linear interpolation and hold, as rivals that draw joint samples: a straight line with a spread fitted to the log.
 
-The spread per axis around the line, or around the held position, is sigma^2(g) = c g^(2H) in the length g of the gap (the time
-since the detection that is held). c and H are fitted by likelihood to detections left out: at one, two, four, ... places
-apart, every octave of g with the same weight, because bursts give hundreds of short gaps and the long ones are what matters.
+The variance per axis around the line, or around the held position, is c g^(2H) / (1 + (g / L)^(2H)) in the length g of the gap
+(the time since the detection that is held): a power law, bounded where the agent stays in one place. c, H and L are fitted by
+likelihood to detections left out: at one, two, four, ... places apart, every octave of g with the same weight, because
+bursts give hundreds of short gaps and the long ones are what matters.
 """
 
 import math
@@ -11,24 +12,32 @@ from typing import Self
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
+from scipy.optimize import minimize
 from torch import Tensor
 
 from cadence.types import Detections, HypothesisSet, WindowBatch
 
-_MAX_RESIDUALS = 4000
+_MAX_RESIDUALS = 2000
 """Residuals of one spacing that enter a fit; more tell nothing new."""
 
 
 @dataclass(frozen=True)
 class GapLaw:
-    """Spread per axis sigma(g) = scale_m g^exponent, g in seconds; a scale of zero (not fitted) has no spread."""
+    """Spread per axis: scale_m g^exponent at gaps g well below limit_s seconds, constant well above.
+
+    A scale of zero (not fitted) has no spread.
+    """
 
     scale_m: float = 0.0
     exponent: float = 0.5
+    limit_s: float = math.inf
 
     def variance(self, gap_s: Tensor) -> Tensor:
         """Variance per axis in m^2 at gaps of `gap_s` seconds (any shape; not negative)."""
-        return self.scale_m**2 * gap_s.clamp_min(0.0).pow(2.0 * self.exponent)
+        gap_s = gap_s.clamp_min(0.0)
+        power = 2.0 * self.exponent
+        return self.scale_m**2 * gap_s.pow(power) / (1.0 + (gap_s / self.limit_s).pow(power))
 
 
 @dataclass
@@ -273,28 +282,24 @@ def _joined(found: list[_Residuals]) -> _Residuals:
 
 
 def _fit_law(residuals: _Residuals, fallback: GapLaw) -> GapLaw:
-    """Scale and exponent of greatest likelihood, on a grid refined twice; the fallback where there is nothing to fit."""
+    """The law of greatest likelihood; the fallback where there is nothing to fit."""
     if not len(residuals.gap_s):
         return fallback
-    octave = residuals.gap_s.log2().round().long()
-    _, member, size = torch.unique(octave, return_inverse=True, return_counts=True)
-    weight = 1.0 / size[member].double()
-    typical_s = float(residuals.gap_s.log().mean().exp())
-    # Around the typical gap, scale and exponent hardly depend on each other.
-    level = 0.5 * math.log(float((weight * residuals.squared_m2).sum() / weight.sum()) + 1e-12)
-    exponent, width = 0.8, 0.75
-    for _ in range(3):
-        levels = level + torch.linspace(-8.0, 8.0, 33, dtype=torch.float64) * width
-        exponents = (exponent + torch.linspace(-1.0, 1.0, 17, dtype=torch.float64) * width).clamp(0.0, 2.0)
-        cost = torch.stack([_cost(residuals, weight, levels, float(value), typical_s) for value in exponents])
-        best = int(cost.argmin())
-        exponent, level = float(exponents[best // len(levels)]), float(levels[best % len(levels)])
-        width *= 0.15
-    return GapLaw(math.exp(level) / typical_s**exponent, exponent)
+    _, member, size = torch.unique(residuals.gap_s.log2().round().long(), return_inverse=True, return_counts=True)
+    weight = (1.0 / size.double())[member] / len(size)
+    typical_s, longest_s = float(residuals.gap_s.log().mean().exp()), float(residuals.gap_s.max())
+    level = 0.5 * math.log(float((weight * residuals.squared_m2).sum()) + 1e-12)
 
+    def law(parameters: NDArray[np.float64]) -> GapLaw:
+        # The level at the typical gap, not at one second: there it hardly depends on the exponent.
+        exponent = float(np.clip(parameters[1], 0.05, 2.0))
+        scale_m = math.exp(float(np.clip(parameters[0], -30.0, 30.0))) / typical_s**exponent
+        return GapLaw(scale_m, exponent, math.exp(float(np.clip(parameters[2], -30.0, 30.0))))
 
-def _cost(residuals: _Residuals, weight: Tensor, levels: Tensor, exponent: float, typical_s: float) -> Tensor:
-    """Negative log likelihood of the residuals for each log scale at the typical gap, [len(levels)]."""
-    shape = residuals.part * (residuals.gap_s / typical_s).pow(2.0 * exponent)
-    variance = (2.0 * levels).exp()[:, None] * shape + residuals.noise_m2 + 1e-12
-    return (weight * (variance.log() + residuals.squared_m2 / variance)).sum(dim=1)
+    def cost(parameters: NDArray[np.float64]) -> float:
+        variance = law(parameters).variance(residuals.gap_s) * residuals.part + residuals.noise_m2 + 1e-12
+        return float((weight * (variance.log() + residuals.squared_m2 / variance)).sum())
+
+    starts = [(level, 0.8, math.log(longest_s * factor)) for factor in (0.1, 10.0)]
+    found = [minimize(cost, start, method="Nelder-Mead", options={"xatol": 1e-3, "fatol": 1e-6}) for start in starts]
+    return law(min(found, key=lambda result: float(result.fun)).x)

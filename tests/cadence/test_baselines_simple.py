@@ -116,3 +116,14 @@ def test_fit_without_enough_detections_keeps_the_law() -> None:
         assert estimator.fit(lonely) == estimator
     still = detections([[0.0, 1.0, 2.0, 3.0]], torch.zeros(1, 4, 2))
     assert Hold().fit(still).law.scale_m < 1e-2
+
+
+def test_fit_sees_that_an_agent_stays_in_its_place() -> None:
+    generator = torch.Generator().manual_seed(4)
+    phase = 6.28 * torch.rand(40, 1, generator=generator, dtype=torch.float64)
+    angle = phase + 0.7 * torch.arange(100, dtype=torch.float64)
+    circle = 10.0 * torch.stack([angle.cos(), angle.sin()], dim=-1)
+    law = Hold().fit(detections([list(map(float, range(100)))] * 40, circle)).law
+    sigma = law.variance(torch.tensor([5.0, 50.0], dtype=torch.float64)).sqrt()
+    assert sigma[1].item() == pytest.approx(10.0, rel=0.15)  # the root of half of twice the mean square of the radius
+    assert sigma[0].item() == pytest.approx(10.0, rel=0.4)
