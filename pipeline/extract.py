@@ -3,7 +3,6 @@
 Decoded messages become rows in the mission frame, sorted by time; whatever is left out is counted in the summary.
 """
 
-import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -14,11 +13,12 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
-from cadence.errors import InputError
+from cadence.errors import ConfigError, InputError
 from pipeline.collapse import Collapsed, collapse
 from pipeline.ingest import CATALOGUE_NAME, open_catalogued_log, read_catalogue
 from pipeline.logs.reader import MissionLog
 from pipeline.manifest import StageResult, run_stage
+from pipeline.obstacles import OBSTACLES_NAME, ObstacleSources, collect_obstacles, write_obstacles
 from pipeline.placement import mission_frame, place
 from pipeline.positions import ChannelReader, Positions, Rows, read_positions
 from pipeline.progress import Progress
@@ -44,6 +44,7 @@ class ExtractConfig:
     max_speed_mps    single positions that could only be reached and left again faster are recorder faults (see `spikes`)
     datum            [latitude, longitude] in degrees of x = y = 0; by default the median of all positions, and unknown for
                      logs in metres
+    obstacles        where obstacles come from; by default what the log says
     """
 
     detections: tuple[SourceConfig, ...] = ()
@@ -57,6 +58,7 @@ class ExtractConfig:
     default_sigma_m: float | None = None
     max_speed_mps: float | None = 1000.0
     datum: tuple[float, float] | None = None
+    obstacles: ObstacleSources = field(default_factory=ObstacleSources)
 
     def __post_init__(self) -> None:
         if not 0 <= self.simultaneity_s < np.inf:
@@ -78,7 +80,11 @@ def extract(directory: Path, config: ExtractConfig, progress: Progress, force: b
     def body(work: Path) -> dict[str, Any]:
         return write_tables(open_catalogued_log(catalogue), work, config, progress)
 
-    return run_stage("extract", directory, config=config, inputs=[directory / CATALOGUE_NAME], body=body, force=force)
+    for path in config.obstacles.files:
+        if not path.is_file():
+            raise ConfigError(f"{path}: not a file; correct extract.obstacles.files")
+    inputs = [directory / CATALOGUE_NAME, *config.obstacles.files]
+    return run_stage("extract", directory, config=config, inputs=inputs, body=body, force=force)
 
 
 def write_tables(log: MissionLog, folder: Path, config: ExtractConfig, progress: Progress) -> dict[str, Any]:
@@ -108,9 +114,8 @@ def write_tables(log: MissionLog, folder: Path, config: ExtractConfig, progress:
     poses = rows["poses"]
     if len(poses):
         write_table(_track_table(log_id, poses, "sensor_id", poses.sensor, POSES), folder / "poses.parquet", "poses", frame)
-    obstacles: list[Mapping[str, Any]] = []
-    text = json.dumps({"version": 1, "obstacles": obstacles}, indent=1) + "\n"
-    (folder / "obstacles.json").write_text(text, encoding="utf-8")
+    obstacles = collect_obstacles(log, config.obstacles, frame, progress.note)
+    write_obstacles(folder / OBSTACLES_NAME, obstacles)
     _tell(counts, detections.positions, log, progress)
     return _summary(log, readers, detections.positions, truth, poses, frame, counts, len(obstacles))
 
