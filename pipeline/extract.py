@@ -36,7 +36,8 @@ _STAMPS_APART_S = 3600.0
 class ExtractConfig:
     """What to take from a log.
 
-    detections, truth, poses   sources; a role left empty is filled by what the names of the topics suggest (see suggest)
+    detections, truth, poses   the sources of each role
+    suggest          fill roles that are left empty by what the names of topics suggest
     thinning         make sparse detections out of a dense channel
     simultaneity_s   detections of one agent within this time are collapsed into one
     start_s, end_s   use only this part of the mission, in seconds after the log's first message
