@@ -9,6 +9,8 @@ Covariances stated in local east and north are used as they are: their axes turn
 the meridians, about (longitude difference) · sin(latitude): 0.5° at 50 km and 50° latitude.
 """
 
+import functools
+
 import numpy as np
 import numpy.typing as npt
 from pyproj import Transformer
@@ -52,6 +54,7 @@ def to_geodetic(frame: Frame, x_m: FloatArray, y_m: FloatArray) -> tuple[FloatAr
     return np.asarray(latitude, dtype=np.float64), np.asarray(longitude, dtype=np.float64)
 
 
+@functools.cache  # building one takes milliseconds
 def _transformer(frame: Frame) -> Transformer:
     if not frame.is_georeferenced:
         raise InputError(f"the mission frame {frame.frame_id!r} has no datum; set extract.datum")

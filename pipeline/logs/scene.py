@@ -4,8 +4,6 @@ Hundreds of lines a tick, thousands of points: building them as protobuf objects
 lines of a group have the same number of points, so every one of them has the same length on the wire: numpy fills a
 structured array whose items *are* the wire format. Fields are in the order of their numbers, so that the bytes equal those
 of the reference classes wherever these write a number at all (they leave out zeros; both parse to the same message).
-
-Wire format: https://protobuf.dev/programming-guides/encoding/ — a tag is (field number << 3) | wire type.
 """
 
 import struct
@@ -16,10 +14,11 @@ from enum import IntEnum
 import numpy as np
 import numpy.typing as npt
 
+from pipeline.logs.wire import BYTES, DOUBLE, field, varint
+
 Floats = npt.NDArray[np.floating]
 
-_DOUBLE, _BYTES = 1, 2  # wire types
-_POINT = 5 << 3 | _BYTES
+_POINT = 5 << 3 | BYTES
 
 
 class LineType(IntEnum):
@@ -74,22 +73,22 @@ class Entity:
 def encode_scene(time_ns: int, frame_id: str, entities: Iterable[Entity]) -> bytes:
     """A self-contained SceneUpdate: everything before is deleted, `entities` are all there is."""
     timestamp = encode_time(time_ns)
-    deletion = _field(1, timestamp) + b"\x10\x01"  # type = ALL
-    body = [_field(1, deletion)]
-    head = _field(1, timestamp) + _field(2, frame_id.encode())
+    deletion = field(1, timestamp) + b"\x10\x01"  # type = ALL
+    body = [field(1, deletion)]
+    head = field(1, timestamp) + field(2, frame_id.encode())
     for entity in entities:
-        parts = [head, _field(3, entity.id.encode())]
+        parts = [head, field(3, entity.id.encode())]
         parts += [_encode_spheres(spheres) for spheres in entity.spheres]
         parts += [_encode_lines(lines) for lines in entity.lines]
         parts += [_encode_label(label) for label in entity.labels]
-        body.append(_field(2, b"".join(parts)))
+        body.append(field(2, b"".join(parts)))
     return b"".join(body)
 
 
 def encode_time(time_ns: int) -> bytes:
     """google.protobuf.Timestamp without its tag."""
     seconds, nanos = divmod(time_ns, 1_000_000_000)
-    return (b"\x08" + _varint(seconds) if seconds else b"") + (b"\x10" + _varint(nanos) if nanos else b"")
+    return (b"\x08" + varint(seconds) if seconds else b"") + (b"\x10" + varint(nanos) if nanos else b"")
 
 
 def round_positions(position_m: Floats, extent_m: float) -> npt.NDArray[np.float64]:
@@ -111,10 +110,10 @@ def _encode_lines(lines: Lines) -> bytes:
     # The z of a flat scene is zero, and zero is not written.
     axes = 3 if np.any(lines.point_m[..., 2]) else 2
     point = np.dtype([("head", "u1", (2,)), ("axis", [("tag", "u1"), ("value", "<f8")], (axes,))])
-    before = (b"\x08" + bytes([lines.type]) if lines.type else b"") + _field(2, _IDENTITY_POSE)
+    before = (b"\x08" + bytes([lines.type]) if lines.type else b"") + field(2, _IDENTITY_POSE)
     before += b"\x19" + struct.pack("<d", lines.thickness_px) + b"\x20\x01"  # scale_invariant
     length = len(before) + num_points * point.itemsize + 2 + _COLOR.itemsize
-    prefix = b"\x5a" + _varint(length) + before
+    prefix = b"\x5a" + varint(length) + before
     line = np.dtype(
         [("prefix", "u1", (len(prefix),)), ("points", point, (num_points,)), ("head", "u1", (2,)), ("color", _COLOR)]
     )
@@ -135,9 +134,9 @@ def _encode_spheres(spheres: Spheres) -> bytes:
     axis = [("tag", "u1"), ("value", "<f8")]
     size, color = _vector(np.full(3, spheres.diameter_m)), np.zeros(1, _COLOR)
     _fill_color(color, spheres.color[None])
-    after = _field(2, size) + _field(3, color.tobytes())
+    after = field(2, size) + field(3, color.tobytes())
     pose = 2 + 27 + len(_IDENTITY_POSE)
-    prefix = b"\x4a" + _varint(2 + pose + len(after)) + bytes([0x0A, pose, 0x0A, 27])
+    prefix = b"\x4a" + varint(2 + pose + len(after)) + bytes([0x0A, pose, 0x0A, 27])
     sphere = np.dtype(
         [("prefix", "u1", (len(prefix),)), ("axis", axis, (3,)), ("after", "u1", (len(_IDENTITY_POSE) + len(after),))]
     )
@@ -153,29 +152,17 @@ def _encode_label(label: Label) -> bytes:
     """TextPrimitive (field 13 of SceneEntity), 14 pixels high."""
     color = np.zeros(1, _COLOR)
     _fill_color(color, label.color[None])
-    pose = _field(1, _vector(label.position_m)) + _IDENTITY_POSE
-    body = _field(1, pose) + b"\x10\x01" + b"\x19" + struct.pack("<d", 14.0) + b"\x20\x01"
-    return _field(13, body + _field(5, color.tobytes()) + _field(6, label.text.encode()))
-
-
-def _varint(value: int) -> bytes:
-    out = bytearray()
-    while value > 0x7F:
-        out.append(value & 0x7F | 0x80)
-        value >>= 7
-    return bytes([*out, value])
-
-
-def _field(number: int, payload: bytes) -> bytes:
-    return _varint(number << 3 | _BYTES) + _varint(len(payload)) + payload
+    pose = field(1, _vector(label.position_m)) + _IDENTITY_POSE
+    body = field(1, pose) + b"\x10\x01" + b"\x19" + struct.pack("<d", 14.0) + b"\x20\x01"
+    return field(13, body + field(5, color.tobytes()) + field(6, label.text.encode()))
 
 
 def _vector(value: Floats) -> bytes:
     """Vector3 or Point3."""
-    return b"".join(bytes([number << 3 | _DOUBLE]) + struct.pack("<d", float(value[number - 1])) for number in (1, 2, 3))
+    return b"".join(bytes([number << 3 | DOUBLE]) + struct.pack("<d", float(value[number - 1])) for number in (1, 2, 3))
 
 
-_IDENTITY_POSE = _field(2, b"\x21" + struct.pack("<d", 1.0))  # Pose with orientation w = 1
+_IDENTITY_POSE = field(2, b"\x21" + struct.pack("<d", 1.0))  # Pose with orientation w = 1
 
 _COLOR = np.dtype([("channel", [("tag", "u1"), ("value", "<f8")], (4,))])
 

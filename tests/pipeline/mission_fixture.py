@@ -6,8 +6,11 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
+from mcap.writer import Writer
 
+from pipeline.ingest import IngestConfig, ingest
 from pipeline.manifest import hash_file
+from pipeline.progress import Progress
 from pipeline.tables import Frame, write_table
 from schemas.tables import DETECTIONS, POSES, TRUTH, WINDOWS, hypotheses_schema
 
@@ -44,11 +47,11 @@ def true_position_m(agent: int, time_s: np.ndarray) -> np.ndarray:
 def build_mission(parent: Path, *, frame: Frame = FRAME, num_hypotheses: int = NUM_HYPOTHESES, log: Path | None = None) -> Path:
     """Write the mission directory `parent`/patrol and return it; T1 has no hypotheses in the last window.
 
-    `log` is the recorded log (default: a placeholder file `parent`/patrol.mcap, written where absent).
+    `log` is the recorded log (default: `parent`/patrol.mcap, written where absent).
     """
     source = log or parent / f"{LOG_ID}.mcap"
     if not source.exists():
-        source.write_bytes(b"placeholder")
+        _write_log(source)
     directory = parent / source.stem
     directory.mkdir(parents=True, exist_ok=True)
     rng = np.random.default_rng(7)
@@ -60,7 +63,7 @@ def build_mission(parent: Path, *, frame: Frame = FRAME, num_hypotheses: int = N
     write_table(hypotheses, directory / "hypotheses.parquet", "hypotheses", frame)
     write_table(windows, directory / "windows.parquet", "windows", frame)
     (directory / "obstacles.json").write_text(json.dumps(OBSTACLES))
-    (directory / "catalogue.json").write_text(json.dumps(_catalogue(source, frame)))
+    ingest(source, directory, IngestConfig(), Progress(quiet=True))
     manifest = {
         "stage": "infer",
         "config": {"seed": 11, "num_hypotheses": num_hypotheses, "checkpoint": "general"},
@@ -132,16 +135,18 @@ def _hypotheses(rng: np.random.Generator, detections: pa.Table, num_hypotheses: 
     return table, pa.Table.from_pylist(windows, schema=WINDOWS)
 
 
-def _catalogue(log: Path, frame: Frame) -> dict[str, object]:
-    return {
-        "version": 1,
-        "path": str(log),
-        "sha256": hash_file(log),
-        "start_ns": START_NS,
-        "end_ns": START_NS + DURATION_NS,
-        "frame_id": frame.frame_id,
-        "channels": [
-            {"topic": "/contacts/T0", "schema_name": "geometry_msgs/msg/PoseStamped", "encoding": "cdr"},
-            {"topic": "/camera/pose", "schema_name": "foxglove.PoseInFrame", "encoding": "protobuf"},
-        ],
-    }
+def _write_log(path: Path) -> None:
+    """A small recorded log: the camera's poses, without hypotheses or truth."""
+    with path.open("wb") as file:
+        writer = Writer(file, chunk_size=4096)
+        writer.start("", "mission_fixture")
+        schema = {"type": "object", "properties": {"frame_id": {"type": "string"}, "x": {"type": "number"}}}
+        schema_id = writer.register_schema("foxglove.PoseInFrame", "jsonschema", json.dumps(schema).encode())
+        channel_id = writer.register_channel("/camera/pose", "json", schema_id)
+        for second in range(DURATION_NS // 1_000_000_000 + 1):
+            time_ns = START_NS + second * 1_000_000_000
+            data = json.dumps({"frame_id": FRAME.frame_id, "x": 3.0 * second}).encode()
+            writer.add_message(channel_id, log_time=time_ns, data=data, publish_time=time_ns, sequence=second)
+        writer.add_attachment(START_NS, START_NS, "notes.txt", "text/plain", b"calm sea")
+        writer.add_metadata("mission", {"name": LOG_ID})
+        writer.finish()

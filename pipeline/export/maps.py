@@ -1,0 +1,104 @@
+"""Messages for the Map panel of georeferenced logs: fixes of means and detections, regions as GeoJSON."""
+
+import json
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import shapely
+from shapely.geometry.base import BaseGeometry
+
+from pipeline.export import numbers
+from pipeline.export.display import Style
+from pipeline.export.playback import LiveAgent, Scene
+from pipeline.frames import to_geodetic
+from pipeline.logs.writer import foxglove_class
+from pipeline.tables import Frame
+
+Float64s = npt.NDArray[np.float64]
+
+_APPROXIMATED, _KNOWN = 1, 3  # foxglove.LocationFix.PositionCovarianceType
+_REGION_STEPS = 24
+_SHARES = (0.9, 0.5)
+
+
+def encode_mean_fix(live: LiveAgent, now_ns: int, frame: Frame, style: Style, time_ns: int) -> bytes:
+    """foxglove.LocationFix of the weighted mean now, with the covariance of the hypotheses."""
+    now_m = live.at(now_ns)
+    covariance = numbers.covariance_m2(now_m, live.weight)
+    color = style.color(live.agent.agent_id)
+    return _encode_fix(live.weight @ now_m, style.z_m, covariance, frame, color, time_ns, _APPROXIMATED)
+
+
+def encode_detection_fix(row: dict[str, Any], frame: Frame, style: Style, time_ns: int) -> bytes:
+    """foxglove.LocationFix of a row of DETECTIONS."""
+    xx, xy, yy = (row[name] for name in ("cov_xx_m2", "cov_xy_m2", "cov_yy_m2"))
+    is_known = xx is not None and yy is not None
+    covariance = np.array([[xx, xy or 0.0], [xy or 0.0, yy]]) if is_known else None
+    position_m, z_m = np.array([row["x_m"], row["y_m"]]), row["z_m"] if row["z_m"] is not None else style.z_m
+    color = style.color(row["agent_id"] or "unknown")
+    return _encode_fix(position_m, z_m, covariance, frame, color, time_ns, _KNOWN if is_known else 0)
+
+
+def _encode_fix(
+    position_m: Float64s, z_m: float, covariance: Float64s | None, frame: Frame, color: Float64s, time_ns: int, kind: int
+) -> bytes:
+    latitude, longitude = to_geodetic(frame, position_m[:1], position_m[1:])
+    message = foxglove_class("foxglove.LocationFix")(
+        frame_id=frame.frame_id,
+        latitude=latitude[0],
+        longitude=longitude[0],
+        altitude=z_m,
+        position_covariance_type=kind,
+    )
+    if covariance is not None:
+        (xx, xy), (_, yy) = covariance.tolist()
+        message.position_covariance.extend([xx, xy, 0.0, xy, yy, 0.0, 0.0, 0.0, 0.0])
+    message.timestamp.FromNanoseconds(time_ns)
+    if "color" in message.DESCRIPTOR.fields_by_name:
+        message.color.r, message.color.g, message.color.b, message.color.a = color
+    data: bytes = message.SerializeToString()
+    return data
+
+
+def encode_map(scene: Scene, frame: Frame, style: Style) -> bytes:
+    """foxglove.GeoJSON: for every live agent its mean track, and around it the regions that hold 90 % and 50 % at each step."""
+    features = []
+    for live in scene.live:
+        hue = style.hue(live.agent.agent_id)
+        name = live.agent.agent_id
+        for share in _SHARES:
+            style_90 = {"color": hue, "weight": 1, "opacity": 0.6, "fillColor": hue, "fillOpacity": 0.25 - 0.15 * share}
+            features.append(_feature(_region(live, share), frame, f"{name} {share:.0%}", style_90))
+        mean = {"color": hue, "weight": 3, "opacity": 1.0}
+        features.append(_feature(shapely.LineString(live.mean_m[_steps(live)]), frame, f"{name} mean", mean))
+    text = json.dumps({"type": "FeatureCollection", "features": features}, separators=(",", ":"), ensure_ascii=False)
+    data: bytes = foxglove_class("foxglove.GeoJSON")(geojson=text).SerializeToString()
+    return data
+
+
+def _region(live: LiveAgent, share: float) -> BaseGeometry:
+    """The union of discs about the mean, each holding `share` of the weight at its step, joined from step to step."""
+    steps = _steps(live)
+    away = np.linalg.norm(live.position_m[:, steps] - live.mean_m[steps], axis=-1)
+    radius = np.maximum(numbers.weighted_quantile(away, live.weight, share), 1e-3 * max(1.0, float(away.max())))
+    discs = shapely.buffer(shapely.points(live.mean_m[steps]), radius, quad_segs=4)
+    if len(discs) == 1:
+        return discs[0]
+    pairs = shapely.geometrycollections(np.stack([discs[:-1], discs[1:]], axis=-1))
+    return shapely.simplify(shapely.union_all(shapely.convex_hull(pairs)), float(np.median(radius)) * 0.05)
+
+
+def _steps(live: LiveAgent) -> npt.NDArray[np.intp]:
+    num_steps = live.position_m.shape[1]
+    return np.unique(np.round(np.linspace(0, num_steps - 1, min(num_steps, _REGION_STEPS)))).astype(np.intp)
+
+
+def _feature(shape_m: BaseGeometry, frame: Frame, name: str, style: dict[str, Any]) -> dict[str, Any]:
+    def degrees(x_m: Float64s, y_m: Float64s) -> tuple[Float64s, Float64s]:
+        latitude, longitude = to_geodetic(frame, x_m, y_m)
+        return np.round(longitude, 6), np.round(latitude, 6)  # GeoJSON (RFC 7946): longitude first; 0.1 m
+
+    shape = shapely.transform(shape_m, lambda point: np.stack(degrees(point[:, 0], point[:, 1]), axis=-1))
+    geometry = json.loads(shapely.to_geojson(shape))
+    return {"type": "Feature", "properties": {"name": name, "style": style}, "geometry": geometry}

@@ -1,0 +1,188 @@
+"""Messages of a side file: hypotheses (lossless, and read back), numbers a tick, detections, heat map, frames."""
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from cadence.errors import InputError
+from pipeline.export import numbers
+from pipeline.export.playback import LiveAgent, Tick
+from pipeline.logs.reader import open_log
+from pipeline.logs.wire import field
+from pipeline.logs.writer import foxglove_class
+from pipeline.results import AgentHypotheses, MissionHypotheses, WindowHypotheses
+from pipeline.tables import Frame
+from schemas import channels
+from schemas.channels import message_class
+
+Float64s = npt.NDArray[np.float64]
+
+_COLD, _HOT = np.array([70.0, 20.0, 130.0]), np.array([255.0, 215.0, 70.0])
+_UINT8, _FLOAT32 = 1, 7  # foxglove.PackedElementField.NumericType
+
+
+def encode_hypotheses(window: WindowHypotheses, frame: Frame, time_ns: int) -> bytes:
+    """cadence.Hypotheses with everything that the tables hold of one window."""
+    head = message_class("cadence.Hypotheses")(
+        log_id=window.log_id,
+        window=window.window,
+        frame_id=frame.frame_id,
+        origin_ns=window.origin_ns,
+        step_ns=window.step_ns,
+        origin_index=window.origin_index,
+        num_steps=window.num_steps,
+        hypothesis=window.hypothesis.tolist(),
+        weight=window.weight.tolist(),
+        latitude_deg=frame.latitude_deg,
+        longitude_deg=frame.longitude_deg,
+    )
+    head.timestamp.FromNanoseconds(time_ns)
+    # Fields may come in any order. A packed field is its bytes: no number passes through Python.
+    return b"".join([head.SerializeToString(), *(field(11, _encode_agent(agent)) for agent in window.agents)])
+
+
+def _encode_agent(agent: AgentHypotheses) -> bytes:
+    head = message_class("cadence.AgentHypotheses")(
+        id=agent.agent_id,
+        status=agent.status,
+        advice=agent.advice or "",
+        num_detections=agent.num_detections,
+        age_s=agent.age_s,
+        spread_m=agent.spread_m,
+        datum_x_m=agent.datum_m[0],
+        datum_y_m=agent.datum_m[1],
+    )
+    position: bytes = np.ascontiguousarray(agent.position_m, dtype="<f4").tobytes()
+    return bytes(head.SerializeToString()) + (field(9, position) if position else b"")
+
+
+def read_hypotheses(path: Path) -> MissionHypotheses:
+    """The hypotheses of a side file (or a combined file), equal to the tables that they were written from.
+
+    Raises `InputError` where the file is no MCAP, is damaged, or holds no hypotheses.
+    """
+    log = open_log(path)
+    if not log.health.is_complete:
+        raise InputError(f"{path}: is damaged ({'; '.join(log.health.problems)}); export it again")
+    kind = message_class("cadence.Hypotheses")
+    messages = [kind.FromString(raw.data) for raw in log.messages({channels.HYPOTHESES.topic})]
+    if not messages:
+        raise InputError(f"{path}: holds no {channels.HYPOTHESES.topic}; is it a file that cadence export wrote?")
+    first = messages[0]
+    frame = Frame(first.frame_id, _optional(first, "latitude_deg"), _optional(first, "longitude_deg"))
+    windows = tuple(_decode_window(message) for message in messages)
+    agent_ids = tuple(sorted({agent.agent_id for window in windows for agent in window.agents}))
+    return MissionHypotheses(frame, agent_ids, windows)
+
+
+def _decode_window(message: Any) -> WindowHypotheses:
+    return WindowHypotheses(
+        log_id=message.log_id,
+        window=message.window,
+        origin_ns=message.origin_ns,
+        step_ns=message.step_ns,
+        origin_index=message.origin_index,
+        num_steps=message.num_steps,
+        hypothesis=np.array(message.hypothesis, dtype=np.int32),
+        weight=np.array(message.weight, dtype=np.float32),
+        agents=tuple(_decode_agent(agent, message.num_steps) for agent in message.agents),
+    )
+
+
+def _decode_agent(agent: Any, num_steps: int) -> AgentHypotheses:
+    return AgentHypotheses(
+        agent_id=agent.id,
+        status=agent.status,
+        advice=agent.advice or None,
+        num_detections=agent.num_detections,
+        age_s=_optional(agent, "age_s"),
+        spread_m=_optional(agent, "spread_m"),
+        datum_m=(agent.datum_x_m, agent.datum_y_m),
+        position_m=np.array(agent.position_m, dtype=np.float32).reshape(-1, num_steps, 2),
+    )
+
+
+def _optional(message: Any, name: str) -> float | None:
+    return float(getattr(message, name)) if message.HasField(name) else None
+
+
+def encode_agents(tick: Tick, time_ns: int) -> bytes:
+    """cadence.Agents: every agent with a live window in numbers."""
+    message = message_class("cadence.Agents")()
+    message.timestamp.FromNanoseconds(time_ns)
+    for live in tick.scene.live if tick.scene else ():
+        _add_state(message.agents.add(), live, tick.time_ns)
+    data: bytes = message.SerializeToString()
+    return data
+
+
+def _add_state(state: Any, live: LiveAgent, now_ns: int) -> None:
+    agent, window = live.agent, live.window
+    now_m = live.at(now_ns)
+    state.id, state.status, state.window = agent.agent_id, agent.status, window.window
+    state.num_detections = agent.num_detections
+    if agent.age_s is not None:
+        state.age_s = agent.age_s + (now_ns - window.origin_ns) * 1e-9
+    state.x_m, state.y_m = (live.weight @ now_m).tolist()
+    state.spread_m = numbers.spread_m(now_m, live.weight)
+    state.horizon_spread_m = numbers.spread_m(live.position_m[:, -1], live.weight)
+    state.speed_mps = numbers.speed_mps(live, now_ns)
+    state.entropy = numbers.weight_entropy(live.weight)
+    state.num_modes = numbers.count_modes(live.position_m[:, -1], live.weight)
+
+
+def encode_detection(row: dict[str, Any], frame: Frame, time_ns: int) -> bytes:
+    """cadence.Detection from a row of DETECTIONS."""
+    message = message_class("cadence.Detection")(frame_id=frame.frame_id)
+    message.timestamp.FromNanoseconds(time_ns)
+    for name in ("agent_id", "sensor_id", "x_m", "y_m", "num_merged", "topic", "log_time_ns", "sequence"):
+        if row[name] is not None:
+            setattr(message, name, row[name])
+    for name in ("z_m", "cov_xx_m2", "cov_xy_m2", "cov_yy_m2", "score"):
+        if row[name] is not None and math.isfinite(row[name]):
+            setattr(message, name, row[name])
+    data: bytes = message.SerializeToString()
+    return data
+
+
+def encode_occupancy(tick: Tick, frame: Frame, time_ns: int, max_cells: int, z_m: float) -> bytes:
+    """foxglove.Grid: how likely each place is to be visited until the end of the future; one clear cell without an agent.
+
+    A cell holds the probability (float32) and a colour for viewers that show colours by default (clear where never visited).
+    """
+    found = numbers.future_occupancy(tick.scene.live if tick.scene else (), max_cells)
+    found = found or numbers.Occupancy(0.0, 0.0, 1.0, np.zeros((1, 1)))
+    probability = found.probability
+    cells = np.zeros(probability.shape, dtype=[("probability", "<f4"), ("rgb", "u1", (3,)), ("alpha", "u1")])
+    cells["probability"] = probability
+    cells["rgb"] = np.round(_COLD + np.sqrt(probability)[..., None] * (_HOT - _COLD))
+    cells["alpha"] = np.where(probability > 0, np.round(60.0 + 160.0 * probability), 0.0)
+    message = foxglove_class("foxglove.Grid")(
+        frame_id=frame.frame_id,
+        column_count=probability.shape[1],
+        row_stride=cells.itemsize * probability.shape[1],
+        cell_stride=cells.itemsize,
+        data=cells.tobytes(),
+    )
+    message.timestamp.FromNanoseconds(time_ns)
+    message.pose.position.x, message.pose.position.y, message.pose.position.z = found.x_m, found.y_m, z_m
+    message.pose.orientation.w = 1.0
+    message.cell_size.x = message.cell_size.y = found.cell_m
+    for name, offset, kind in (("probability", 0, _FLOAT32), ("red", 4, _UINT8), ("green", 5, _UINT8), ("blue", 6, _UINT8)):
+        message.fields.add(name=name, offset=offset, type=kind)
+    message.fields.add(name="alpha", offset=7, type=_UINT8)
+    data: bytes = message.SerializeToString()
+    return data
+
+
+def encode_transform(frame: Frame, time_ns: int) -> bytes:
+    """foxglove.FrameTransform that makes a mission frame known to the viewer: it lies in our root, not displaced."""
+    message = foxglove_class("foxglove.FrameTransform")(parent_frame_id=channels.ROOT_FRAME_ID, child_frame_id=frame.frame_id)
+    message.timestamp.FromNanoseconds(time_ns)
+    message.translation.SetInParent()
+    message.rotation.w = 1.0
+    data: bytes = message.SerializeToString()
+    return data

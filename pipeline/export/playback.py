@@ -1,0 +1,114 @@
+"""What is to be seen when: the windows on the mission's time line, and the moments at which the scene is written."""
+
+import bisect
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+
+from pipeline.results import AgentHypotheses, MissionHypotheses, WindowHypotheses
+
+Float64s = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class LiveAgent:
+    """One agent of one window, ready to be drawn: positions in the mission frame, without hypotheses that are not finite.
+
+    hypothesis [K] row in the window, weight [K] sums to one, position_m [K, T, 2] float64.
+    """
+
+    agent: AgentHypotheses
+    window: WindowHypotheses
+    hypothesis: npt.NDArray[np.intp]
+    weight: Float64s
+    position_m: Float64s
+
+    @cached_property
+    def mean_m(self) -> Float64s:
+        """Weighted mean track [T, 2]."""
+        return np.asarray(np.einsum("k,ktd->td", self.weight, self.position_m))
+
+    def at(self, time_ns: int) -> Float64s:
+        """Positions [K, 2] at a time: linear between steps, the first or last step outside of them."""
+        steps = self.window.origin_index + (time_ns - self.window.origin_ns) / self.window.step_ns
+        low = int(np.clip(np.floor(steps), 0, max(self.window.num_steps - 2, 0)))
+        high = min(low + 1, self.window.num_steps - 1)
+        share = float(np.clip(steps - low, 0.0, 1.0))
+        return np.asarray((1.0 - share) * self.position_m[:, low] + share * self.position_m[:, high])
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """What the newest windows (those of one origin) say; shown from `origin_ns` until `end_ns`."""
+
+    origin_ns: int
+    start_ns: int
+    end_ns: int
+    agents: tuple[AgentHypotheses, ...]
+    live: tuple[LiveAgent, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Tick:
+    """A moment at which the scene is written; `scene` is None where no window is live any more."""
+
+    time_ns: int
+    scene: Scene | None
+
+
+def build_scenes(mission: MissionHypotheses) -> list[Scene]:
+    """The scenes of a mission by origin; windows with the same origin are one scene."""
+    groups = [list(group) for _, group in itertools.groupby(mission.windows, key=lambda window: window.origin_ns)]
+    origins = [group[0].origin_ns for group in groups]
+    stride_ns = int(np.median(np.diff(origins))) if len(origins) > 1 else 0
+    return [_scene(group, stride_ns) for group in groups]
+
+
+def plan_ticks(scenes: Sequence[Scene], tick_ns: int, end_ns: int) -> list[Tick]:
+    """Ticks `tick_ns` apart which show the newest scene each, moved by less than a tick to fall on origins.
+
+    A tick without a scene follows the end of a window that no other replaces. Nothing comes after both `end_ns` and the
+    last origin.
+    """
+    ticks: list[Tick] = []
+    origins = [scene.origin_ns for scene in scenes]
+    time_ns = origins[0] if origins else end_ns + 1
+    while origins and time_ns <= max(end_ns, origins[-1]):
+        newest = scenes[bisect.bisect_right(origins, time_ns) - 1]
+        is_live = time_ns <= newest.end_ns
+        ticks.append(Tick(time_ns, newest if is_live else None))
+        index = bisect.bisect_left(origins, time_ns + (tick_ns if is_live else 1))
+        following = origins[index] if index < len(origins) else None
+        if not is_live and following is None:
+            break
+        is_near = following is not None and (not is_live or following < time_ns + 2 * tick_ns)
+        time_ns = following if following is not None and is_near else time_ns + tick_ns
+    return ticks
+
+
+def _scene(group: list[WindowHypotheses], stride_ns: int) -> Scene:
+    live = [_live(window, agent) for window in group for agent in window.agents if agent.is_live]
+    shown = tuple(agent for agent in live if len(agent.hypothesis))
+    origin_ns = group[0].origin_ns
+    return Scene(
+        origin_ns=origin_ns,
+        start_ns=min(window.start_ns for window in group),
+        # Without a future (or with a short one) a window stands until the next is due.
+        end_ns=max(origin_ns + stride_ns, *(window.end_ns for window in group)),
+        agents=tuple(agent for window in group for agent in window.agents),
+        live=tuple(sorted(shown, key=lambda agent: agent.agent.agent_id)),
+    )
+
+
+def _live(window: WindowHypotheses, agent: AgentHypotheses) -> LiveAgent:
+    is_finite = np.isfinite(agent.position_m).all(axis=(1, 2))
+    kept = np.flatnonzero(is_finite)
+    weight = np.nan_to_num(window.weight[kept].astype(np.float64))
+    if not weight.sum() > 0:
+        weight = np.ones(len(kept))
+    share = np.asarray(weight / max(float(weight.sum()), 1e-300))
+    return LiveAgent(agent, window, kept, share, agent.position_m[kept].astype(np.float64) + agent.datum_m)

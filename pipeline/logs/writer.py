@@ -1,0 +1,118 @@
+"""Writing MCAP: chunked, compressed, indexed, with checksums and statistics, and the same bytes for the same messages."""
+
+import functools
+from pathlib import Path
+from types import TracebackType
+from typing import Any, BinaryIO, Literal, Self
+
+import foxglove_schemas_protobuf.FrameTransform_pb2 as frame_transform
+import foxglove_schemas_protobuf.GeoJSON_pb2 as geojson
+import foxglove_schemas_protobuf.Grid_pb2 as grid
+import foxglove_schemas_protobuf.LocationFix_pb2 as location_fix
+import foxglove_schemas_protobuf.SceneUpdate_pb2 as scene_update
+from google.protobuf import descriptor_pb2
+from mcap.writer import CompressionType, Writer
+
+from schemas.channels import DESCRIPTOR_PATH, Channel
+
+Compression = Literal["zstd", "lz4", "none"]
+
+LIBRARY = "cadence"
+"""The writer's name in the header; no version, so that the bytes depend on the content only (versions: Metadata record)."""
+
+CHUNK_BYTES = 4 * 1024 * 1024
+"""Scene messages are some 100 kB and resemble their neighbours: a chunk must hold many for the compressor to see it."""
+
+_FOXGLOVE = {
+    f"foxglove.{name}": getattr(module, name)
+    for name, module in {
+        "FrameTransform": frame_transform,
+        "GeoJSON": geojson,
+        "Grid": grid,
+        "LocationFix": location_fix,
+        "SceneUpdate": scene_update,
+    }.items()
+}
+
+
+class LogWriter:
+    """An MCAP file under construction; a context manager that writes the summary when all went well.
+
+    Channels are added when first written to. Messages should come in the order of their times: chunks then do not overlap.
+    """
+
+    def __init__(self, path: Path, compression: Compression = "zstd", profile: str = "", library: str = LIBRARY) -> None:
+        self._path = path
+        self._compression = CompressionType[compression.upper()]
+        self._header = (profile, library)
+        self._channel_ids: dict[Channel, int] = {}
+        self._schema_ids: dict[str, int] = {}
+        self._sequences: dict[int, int] = {}
+        self._file: BinaryIO | None = None
+        self._writer: Writer | None = None
+
+    def __enter__(self) -> Self:
+        """Create the file."""
+        self._file = self._path.open("wb")
+        self._writer = Writer(self._file, chunk_size=CHUNK_BYTES, compression=self._compression, enable_data_crcs=True)
+        self._writer.start(*self._header)
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        """Finish the file, or leave the part that was written (its folder is temporary) where something failed."""
+        assert self._file is not None and self._writer is not None
+        try:
+            if error is None:
+                self._writer.finish()  # type: ignore[no-untyped-call]
+        finally:
+            self._file.close()
+
+    @property
+    def raw(self) -> Writer:
+        """The writer below, for records that are copied from another log."""
+        assert self._writer is not None, "use `with LogWriter(...)`"
+        return self._writer
+
+    def write(self, channel: Channel, time_ns: int, data: bytes) -> None:
+        """Append one protobuf message with log time and publish time `time_ns`."""
+        number = self._channel_ids.get(channel)
+        if number is None:
+            number = self.raw.register_channel(channel.topic, "protobuf", self._schema_id(channel.message))
+            self._channel_ids[channel] = number
+        sequence = self._sequences.get(number, 0)
+        self._sequences[number] = sequence + 1
+        self.raw.add_message(number, log_time=time_ns, data=data, publish_time=time_ns, sequence=sequence)
+
+    def metadata(self, name: str, content: dict[str, str]) -> None:
+        """Append a Metadata record."""
+        self.raw.add_metadata(name, content)
+
+    def _schema_id(self, name: str) -> int:
+        if name not in self._schema_ids:
+            self._schema_ids[name] = self.raw.register_schema(name, "protobuf", schema_bytes(name))
+        return self._schema_ids[name]
+
+
+def foxglove_class(name: str) -> Any:
+    """The published protobuf class, for example of "foxglove.Grid"; `KeyError` for one that we do not write."""
+    return _FOXGLOVE[name]
+
+
+@functools.cache
+def schema_bytes(name: str) -> bytes:
+    """A serialised FileDescriptorSet with the message `name` and all that it depends on, dependencies first."""
+    if name.startswith("cadence."):
+        return DESCRIPTOR_PATH.read_bytes()
+    found = descriptor_pb2.FileDescriptorSet()
+    seen: set[str] = set()
+
+    def add(file: Any) -> None:
+        if file.name not in seen:
+            seen.add(file.name)
+            for dependency in file.dependencies:
+                add(dependency)
+            file.CopyToProto(found.file.add())
+
+    add(foxglove_class(name).DESCRIPTOR.file)
+    data: bytes = found.SerializeToString(deterministic=True)
+    return data
