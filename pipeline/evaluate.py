@@ -17,13 +17,15 @@ from torch import Tensor
 
 from cadence.bank.bank import Bank
 from cadence.baselines.interpolation import Hold, LinearInterpolation
+from cadence.constraints.checker import segments_in_collision, states_in_collision
 from cadence.errors import InputError
 from cadence.types import Detections, Estimator, HypothesisSet
 from pipeline.manifest import StageResult, read_manifest, run_stage, write_atomic
+from pipeline.obstacles import OBSTACLES_NAME, read_obstacles
 from pipeline.progress import Progress
 from pipeline.results import MissionHypotheses, read_hypothesis_tables
 from pipeline.score_tables import OWN_NAME, ScoredMission, as_csv, as_json, as_markdown, headline, pool
-from pipeline.scores import compare, score_in_chunks
+from pipeline.scores import IsInside, compare, score_in_chunks
 from pipeline.tables import read_table
 from pipeline.windows import UNKNOWN_AGENT, Grid, MissionWindows, build_windows, fit_tracks, truth_on_grid
 
@@ -72,7 +74,7 @@ def evaluate(directory: Path, config: EvaluateConfig, progress: Progress, force:
             f"{inputs[-1]}: not found, so there is nothing to score against; name a truth channel in [[extract.truth]] "
             "or thin a dense one (extract.thinning), then run extract and infer again"
         )
-    inputs += [path for path in [directory / "obstacles.json"] if path.is_file()]
+    inputs += [path for path in [directory / OBSTACLES_NAME] if path.is_file()]
 
     def body(work: Path) -> Mapping[str, Any]:
         scored = score_mission(directory, config, progress)
@@ -112,8 +114,9 @@ def score_mission(directory: Path, config: EvaluateConfig, progress: Progress) -
     def draw(index: Tensor) -> HypothesisSet:
         return _stored_hypotheses(stored, windows, index, num_hypotheses)
 
+    collides = _collision_test(directory, windows)
     with progress.bar(windows.batch.num_windows * (1 + len(config.rivals)), "evaluate", "window") as bar:
-        own = score_in_chunks(draw, windows.batch, truth_m, is_known, num_hypotheses, None, bar.update)
+        own = score_in_chunks(draw, windows.batch, truth_m, is_known, num_hypotheses, collides, bar.update)
         if not len(own):
             raise InputError(
                 f"{directory}: no step has both hypotheses and truth (truth samples at most {max_gap_s:g} s apart); "
@@ -123,7 +126,7 @@ def score_mission(directory: Path, config: EvaluateConfig, progress: Progress) -
         is_scored[torch.from_numpy(own.window.astype(np.int64)), torch.from_numpy(own.agent.astype(np.int64))] = True
         tracks = fit_tracks(detections, grid, sigma_m)
         rivals = {name: RIVALS[name](tracks, grid.step_s) for name in config.rivals}
-        cells = compare(rivals, windows.batch, truth_m, is_known & is_scored[..., None], num_hypotheses, None, bar.update)
+        cells = compare(rivals, windows.batch, truth_m, is_known & is_scored[..., None], num_hypotheses, collides, bar.update)
     is_asked = is_known.any(dim=-1) & windows.batch.is_active
     return ScoredMission(
         log_id=next((window.log_id for window in stored.windows), directory.name),
@@ -155,6 +158,22 @@ def _stored_grid(stored: MissionHypotheses, directory: Path) -> Grid:
     origins_ns = np.array([window.origin_ns for window in stored.windows], dtype=np.int64)
     first = drawn[0]
     return Grid(first.step_ns, first.origin_index + 1, first.num_steps - first.origin_index - 1, origins_ns)
+
+
+def _collision_test(directory: Path, windows: MissionWindows) -> IsInside | None:
+    """Which states touch an obstacle, themselves or on the straight way from the step before; None without obstacles."""
+    path = directory / OBSTACLES_NAME
+    obstacles = read_obstacles(path) if path.is_file() else None
+    if obstacles is None or obstacles.count == 0:
+        return None
+
+    def collides(position_m: Tensor, index: Tensor) -> Tensor:
+        offset_m = torch.from_numpy(windows.datum_m[index.numpy()])[:, None, None, None]
+        hit = states_in_collision(position_m, obstacles, offset_m=offset_m)
+        hit[..., 1:] |= segments_in_collision(position_m, obstacles, offset_m=offset_m)
+        return hit
+
+    return collides
 
 
 def _default_sigma_m(directory: Path) -> float:

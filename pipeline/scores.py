@@ -198,6 +198,8 @@ def summarise(
     rows = []
     for part in PARTS:
         for metric in METRICS:
+            if metric == "trajectory_energy_score_m" and part not in ("past", "future"):
+                continue  # it is that of the whole past, or the whole future
             rows.append(_row(name, part, "part", (None, None), metric, cells, groups, cells.is_in(part), rng, num_resamples))
     for part, by, distance in _distances(cells):
         for low, high in _octaves(distance[cells.is_in(part)]):

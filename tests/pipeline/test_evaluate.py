@@ -163,6 +163,21 @@ def test_stage_writes_scores_and_skips(mission: Path) -> None:
     assert evaluate(mission, SIMPLE, QUIET).status == "skipped"
 
 
+def test_collisions_are_those_of_the_stated_obstacles(tmp_path: Path) -> None:
+    mission = build_mission(tmp_path)
+    config = EvaluateConfig(rivals=("hold",))
+
+    def shares(obstacles: list[dict[str, object]]) -> list[float]:
+        (mission / "obstacles.json").write_text(json.dumps({"version": 1, "obstacles": obstacles}))
+        return [cells.column("collision_share").mean() for cells in score_mission(mission, config, QUIET).cells.values()]
+
+    assert np.isnan(shares([])).all()
+    assert shares([{"kind": "circle", "x_m": 1600.0, "y_m": -200.0, "radius_m": 1e5}]) == pytest.approx([1.0, 1.0])
+    assert shares([{"kind": "circle", "x_m": 1e7, "y_m": 1e7, "radius_m": 1.0}]) == [0.0, 0.0]
+    some = shares([{"kind": "circle", "x_m": 1700.0, "y_m": -100.0, "radius_m": 40.0}])
+    assert all(0.0 < share < 0.5 for share in some)
+
+
 def test_agents_without_hypotheses_are_counted(tmp_path: Path) -> None:
     mission = build_mission(tmp_path)
     scored = score_mission(mission, EvaluateConfig(rivals=()), QUIET)
@@ -185,6 +200,10 @@ def test_scores_do_not_depend_on_where_the_frame_lies(mission: Path, tmp_path: P
     for name in ("detections", "truth"):
         shift(name, "x_m", "y_m", lambda column, values: values + (512.0 if column.startswith("x") else -2048.0))
     shift("hypotheses", "datum_x_m", "datum_y_m", lambda column, values: values + (512.0 if "x_m" in column else -2048.0))
+    circle = {"kind": "circle", "x_m": 1700.0, "y_m": -100.0, "radius_m": 40.0}
+    far = circle | {"x_m": 1700.0 + 512.0, "y_m": -100.0 - 2048.0}
+    for path, obstacle in ((mission, circle), (moved, far)):
+        (path / "obstacles.json").write_text(json.dumps({"version": 1, "obstacles": [obstacle]}))
     one, two = (score_mission(path, SIMPLE, QUIET).cells for path in (mission, moved))
     for name in one:
         np.testing.assert_allclose(two[name].value, one[name].value, atol=1e-6)
