@@ -6,6 +6,7 @@ from cadence.errors import ConfigError, InputError
 from pipeline.logs.reader import Channel
 from pipeline.mapping import SuggestedMapping, dense_sources, describe_channels, suggest_mapping
 from pipeline.positions import ChannelReader
+from pipeline.presets import preset_for
 from pipeline.sources import SourceConfig
 from pipeline.thinning import ThinningConfig
 
@@ -32,7 +33,8 @@ def select_readers(
             chosen[role] = _untaken(getattr(suggested, role), channels, taken)
     if thinning.enabled and thinning.thin_from == "truth":
         if not chosen["truth"]:
-            chosen["truth"] = _dense(suggested, channels, taken, bool(chosen["detections"]))
+            # The only dense channel may have been stated as a pose: that is what pasting the suggested lines gives.
+            chosen["truth"] = _dense(suggested, channels, _topics(stated["detections"], channels), bool(chosen["detections"]))
             chosen["poses"] = _untaken(chosen["poses"], channels, _topics(chosen["truth"], channels))
         chosen["detections"] = ()
     elif not chosen["detections"]:
@@ -81,7 +83,10 @@ def _readers(role: str, source: SourceConfig, is_stated: bool, channels: Sequenc
 
 def _no_detections(suggested: SuggestedMapping, channels: Sequence[Channel]) -> str:
     """One line: what is there, and the lines that would make detections of it."""
-    unread = [topic for topic, role in suggested.roles.items() if role == "detections"]
+    named = [channel for channel in channels if suggested.roles.get(channel.topic) == "detections"]
+    unread = sorted({channel.topic for channel in named if preset_for(channel.schema_name) is None})
+    if named and not unread:
+        return f"no message was recorded on {describe_channels(named)}; name other topics under [[extract.detections]]"
     if unread:
         paths = 'add [[extract.detections]] with topic, x = "path", y = "path" (or latitude, longitude)'
         return f"no preset knows the schema of {', '.join(unread)}; {paths}; cadence info LOG prints the lines"

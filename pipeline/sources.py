@@ -42,7 +42,8 @@ class SourceConfig:
     preset      a name of `pipeline.presets`; without one and without paths it is chosen by the schema
     agent, agent_path    who was seen: a constant, or a message path; neither (nor `{agent}`) means origin unknown
     sensor, sensor_path  who saw it
-    x, y, z     message paths in metres; or latitude, longitude (degrees) and altitude (metres)
+    x, y, z     message paths of a position in metres
+    latitude, longitude, altitude   message paths of a position in degrees (and metres), instead of x, y and z
     covariance  message path of 1, 4, 9 or 36 numbers (a variance, or rows of a matrix), x (east) and y (north) first, m²
     sigma_m     standard deviation of x and y where the message states no covariance
     score       message path of a confidence

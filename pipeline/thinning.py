@@ -19,7 +19,7 @@ class ThinningConfig:
     enabled           make detections by thinning instead of using the log's own (or, see thin_from, thin the log's own)
     thin_from         the dense channel: the truth, or the detections that the log holds
     seed              same seed, same detections; agents are independent of one another
-    mean_gap_s, mean_burst_s   the share of time in view is burst / (gap + burst)
+    mean_gap_s, mean_burst_s   mean lengths in seconds; the share of time in view is burst / (gap + burst)
     min_interval_s    inside a burst, the least time between two detections; 0 keeps every sample
     noise_m           standard deviation of noise added to x and y, and stated in the covariance
     position_floor_m  standard deviation stated in the covariance in addition to the noise, added to nothing

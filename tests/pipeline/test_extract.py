@@ -15,8 +15,10 @@ from cadence.errors import CadenceError, ConfigError, InputError
 from pipeline.config import read_config
 from pipeline.extract import ExtractConfig, extract, write_tables
 from pipeline.ingest import IngestConfig, ingest
-from pipeline.logs.reader import open_log
+from pipeline.logs.reader import Channel, open_log
+from pipeline.mapping import suggest_mapping
 from pipeline.progress import Progress
+from pipeline.selection import _no_detections
 from pipeline.tables import Frame, read_table
 from schemas.tables import DETECTIONS, POSES, TRUTH
 
@@ -238,6 +240,8 @@ def test_thinning_the_only_dense_channel(tmp_path: Path) -> None:
     again = run(tmp_path, DENSE, thinning=thinning)
     assert again.detections.equals(found.detections)
     assert not run(tmp_path, DENSE, thinning={**thinning, "seed": 1}).detections.equals(found.detections)
+    pasted = {"poses": [{"topic": "/{sensor}/pose", "preset": "PoseInFrame"}]}  # as cadence info suggests
+    assert run(tmp_path, DENSE, thinning=thinning, **pasted).detections.equals(found.detections)
     alone = run(tmp_path, [row for row in DENSE if row.topic == "/cub1/pose"], thinning=thinning)
     of_cub1 = found.detections.filter(pc.equal(found.detections["agent_id"], "cub1"))
     assert alone.detections["x_m"].equals(of_cub1["x_m"])
@@ -260,6 +264,9 @@ def test_thinning_takes_the_truth_or_the_detections(tmp_path: Path) -> None:
     )
 
 
+EMPTY = Channel(1, "/contacts/A", "json", "foxglove.LocationFix", "jsonschema", b"{}", 0, {})
+
+
 def mk(folder: Path) -> Path:
     folder.mkdir()
     return folder
@@ -271,6 +278,7 @@ def test_nothing_to_detect(tmp_path: Path) -> None:
     fails(
         mk(tmp_path / "b"), [Row("/imu", "sensor_msgs/Imu", 1.0, {})], InputError, r"/imu \(sensor_msgs/Imu\); add \[\[extract"
     )
+    assert "no message was recorded" in _no_detections(suggest_mapping([EMPTY]), [EMPTY])
     fails(mk(tmp_path / "c"), [Row("/detections", "my.Own", 1.0, {})], InputError, "no preset knows the schema of /detections")
 
 
