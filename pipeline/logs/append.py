@@ -31,7 +31,7 @@ def write_combined(source: Path, side: Path, target: Path, compression: Compress
         header = next(theirs, None)
         profile = header.profile if isinstance(header, records.Header) else ""
         with LogWriter(target, compression, profile) as writer:
-            added, copied = _Copier(writer.raw), _Copier(writer.raw)
+            added, copied = _Copier(side, writer.raw), _Copier(source, writer.raw)
             waiting = added.next_message(ours)
             for record in theirs:
                 if isinstance(record, records.Message):
@@ -48,7 +48,8 @@ def write_combined(source: Path, side: Path, target: Path, compression: Compress
 class _Copier:
     """Copies records of one log; its schemas and channels get new ids in the target."""
 
-    def __init__(self, writer: Writer) -> None:
+    def __init__(self, path: Path, writer: Writer) -> None:
+        self._path = path
         self._writer = writer
         self._schema_ids = {0: 0}  # 0 means: no schema
         self._channel_ids: dict[int, int] = {}
@@ -67,12 +68,13 @@ class _Copier:
             case records.Schema() if record.id not in self._schema_ids:
                 self._schema_ids[record.id] = self._writer.register_schema(record.name, record.encoding, record.data)
             case records.Channel() if record.id not in self._channel_ids:
+                schema_id = self._known(self._schema_ids, record.schema_id)
                 self._channel_ids[record.id] = self._writer.register_channel(
-                    record.topic, record.message_encoding, self._schema_ids[record.schema_id], record.metadata
+                    record.topic, record.message_encoding, schema_id, record.metadata
                 )
             case records.Message():
                 self._writer.add_message(
-                    self._channel_ids[record.channel_id],
+                    self._known(self._channel_ids, record.channel_id),
                     record.log_time,
                     record.data,
                     record.publish_time,
@@ -84,6 +86,11 @@ class _Copier:
                 self._writer.add_metadata(record.name, record.metadata)
             case _:
                 pass
+
+    def _known(self, ids: dict[int, int], number: int) -> int:
+        if number not in ids:
+            raise InputError(f"{self._path}: is damaged (a channel or schema is missing); export without combined")
+        return ids[number]
 
 
 def _records(path: Path, file: BinaryIO) -> Iterator[Any]:
