@@ -3,8 +3,9 @@
 Decoded messages become rows in the mission frame, sorted by time; whatever is left out is counted in the summary.
 """
 
+import contextlib
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -91,20 +92,11 @@ def extract(directory: Path, config: ExtractConfig, progress: Progress, force: b
 def write_tables(log: MissionLog, folder: Path, config: ExtractConfig, progress: Progress) -> dict[str, Any]:
     """Write the files of the stage for `log` into `folder`; the summary."""
     stated = {"detections": config.detections, "truth": config.truth, "poses": config.poses}
-    readers = select_readers(stated, config.suggest, config.thinning, log.channels)
+    with _about(log):
+        readers = select_readers(stated, config.suggest, config.thinning, log.channels)
     counts = read_positions(log, readers, progress)
-    rows = {role: _columns(role, readers, log, config, counts) for role in ROLES}
-    primary = "truth" if config.thinning.enabled and config.thinning.thin_from == "truth" else "detections"
-    _check_any(log, primary, rows[primary], counts, config)
-    frame = mission_frame(rows[primary], [rows[role] for role in ROLES if role != primary], config.datum)
-    for role in ROLES:
-        rows[role] = _without_spikes(_placed(role, rows[role], frame, counts), config.max_speed_mps, counts)
-    if config.thinning.enabled:
-        rows["detections"] = _thinned(rows[primary], config.thinning)
-        if len(rows["detections"]) == 0:
-            raise InputError(
-                f"{log.path}: thinning left no detection; choose a smaller extract.thinning.mean_gap_s or another seed"
-            )
+    with _about(log):
+        rows, frame = _rows_in_frame(log, readers, config, counts)
     detections = collapse(_with_default_sigma(rows["detections"], config.default_sigma_m), config.simultaneity_s)
     counts["collapsed"] = len(rows["detections"]) - len(detections.positions)
     truth, counts["duplicate_truth"] = _without_repeats(rows["truth"])
@@ -119,6 +111,32 @@ def write_tables(log: MissionLog, folder: Path, config: ExtractConfig, progress:
     write_obstacles(folder / OBSTACLES_NAME, obstacles)
     _tell(counts, detections.positions, log, progress)
     return _summary(log, readers, detections.positions, truth, poses, frame, counts, len(obstacles))
+
+
+@contextlib.contextmanager
+def _about(log: MissionLog) -> Iterator[None]:
+    """Put the log's path before what is wrong with its content."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f"{log.path}: {error}") from error
+
+
+def _rows_in_frame(
+    log: MissionLog, readers: Sequence[ChannelReader], config: ExtractConfig, counts: Counter[str]
+) -> tuple[dict[str, Positions], Frame]:
+    """The rows of every role, placed in the mission frame and thinned, and that frame."""
+    rows = {role: _columns(role, readers, log, config, counts) for role in ROLES}
+    primary = "truth" if config.thinning.enabled and config.thinning.thin_from == "truth" else "detections"
+    _check_any(primary, rows[primary], counts)
+    frame = mission_frame(rows[primary], [rows[role] for role in ROLES if role != primary], config.datum)
+    for role in ROLES:
+        rows[role] = _without_spikes(_placed(role, rows[role], frame, counts), config.max_speed_mps, counts)
+    if config.thinning.enabled:
+        rows["detections"] = _thinned(rows[primary], config.thinning)
+        if len(rows["detections"]) == 0:
+            raise InputError("thinning left no detection; choose a smaller extract.thinning.mean_gap_s or another seed")
+    return rows, frame
 
 
 def _columns(
@@ -142,7 +160,7 @@ def _columns(
     return rows[np.argsort(rows.time_ns, kind="stable")]
 
 
-def _check_any(log: MissionLog, role: str, rows: Positions, counts: Counter[str], config: ExtractConfig) -> None:
+def _check_any(role: str, rows: Positions, counts: Counter[str]) -> None:
     if len(rows):
         return
     if counts[f"finite_{role}"]:
@@ -157,7 +175,7 @@ def _check_any(log: MissionLog, role: str, rows: Positions, counts: Counter[str]
         reason = "no message of the mapped topics has a position where the mapping looks for it; correct the [extract] entries"
     else:
         reason = f"the topics mapped as {role} hold no message; map another topic (cadence info lists them)"
-    raise InputError(f"{log.path}: {reason}")
+    raise InputError(reason)
 
 
 def _placed(role: str, rows: Positions, frame: Frame, counts: Counter[str]) -> Positions:
