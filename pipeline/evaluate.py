@@ -18,7 +18,7 @@ from torch import Tensor
 from cadence.bank.bank import Bank
 from cadence.baselines.interpolation import Hold, LinearInterpolation
 from cadence.constraints.checker import segments_in_collision, states_in_collision
-from cadence.errors import InputError
+from cadence.errors import CadenceError, InputError
 from cadence.types import Detections, Estimator, HypothesisSet
 from pipeline.manifest import StageResult, read_manifest, run_stage, write_atomic
 from pipeline.obstacles import OBSTACLES_NAME, read_obstacles
@@ -84,16 +84,25 @@ def evaluate(directory: Path, config: EvaluateConfig, progress: Progress, force:
 
 
 def evaluate_folder(folder: Path, config: EvaluateConfig, progress: Progress) -> StageResult:
-    """Pooled scores of all mission directories in `folder`, written there; intervals over logs where there are six or more."""
+    """Pooled scores of all mission directories in `folder`, written there; intervals over logs where there are six or more.
+
+    A mission that cannot be scored (no truth, say) is named and left out; raises where none can be.
+    """
     directories = sorted(path.parent for path in folder.glob("*/hypotheses.parquet"))
     if not directories:
         raise InputError(f"{folder}: holds no mission directory with hypotheses.parquet; run cadence run --out {folder} first")
-    scored = []
+    scored, failures = [], []
     with progress.bar(len(directories), "evaluate", "log") as bar:
         for directory in directories:
-            scored.append(score_mission(directory, config, progress))
+            try:
+                scored.append(score_mission(directory, config, progress))
+            except CadenceError as error:
+                failures.append(error)
+                progress.warn(str(error))
             bar.update(1)
-    summary = _write_scores(scored, folder, config)
+    if not scored:
+        raise failures[0]
+    summary = _write_scores(scored, folder, config) | {"num_failed": len(failures)}
     outputs = tuple(folder / f"scores.{suffix}" for suffix in ("csv", "json", "md"))
     return StageResult("evaluate", "done", outputs, summary)
 

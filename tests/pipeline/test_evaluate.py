@@ -220,6 +220,8 @@ def test_folder_pools_missions(tmp_path: Path) -> None:
     assert result.summary["num_logs"] == 6 and scores["grouped_by"] == "log"
     row = next(r for r in scores["rows"] if r["metric"] == "ade_m" and r["part"] == "past" and r["by"] == "part")
     assert row["num_groups"] == 6 and row["low"] == pytest.approx(row["high"])  # six times the same log
+    delay_truth(build_mission(folder))
+    assert evaluate_folder(folder, EvaluateConfig(rivals=(), num_resamples=20), QUIET).summary["num_failed"] == 1
     with pytest.raises(InputError, match="no mission directory"):
         evaluate_folder(tmp_path / "missions" / "m0", SIMPLE, QUIET)
 
