@@ -275,7 +275,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         _complain(error)
         return error.exit_code
     except typer.TyperException as error:
-        _complain(UsageError(f"{error.format_message()} Try: cadence --help"))
+        _complain(UsageError(f"{error.format_message()} (see cadence --help)"))
         return UsageError.exit_code
     except BrokenPipeError:
         # The reader (head, less) has what it wanted; what Python would still flush at exit goes nowhere.

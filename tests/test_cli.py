@@ -55,7 +55,7 @@ def test_version(capsys):
         (["run"], "Missing argument 'LOG'"),
         (["run", "x.mcap"], "Missing option '--out'"),
         (["run", "x.mcap", "--out", "o", "--nope"], "No such option: --nope"),
-        (["run", "x.mcap", "--out", "o", "--seed", "x"], "'x' is not a valid int"),
+        (["run", "x.mcap", "--out", "o", "--seed", "x"], "'--seed': Input should be a valid integer"),
     ],
 )
 def test_wrong_call_is_one_line_and_exit_code_2(arguments, says, capsys):
