@@ -6,6 +6,7 @@ be led around with the margin that was asked for is tried again with smaller one
 """
 
 import itertools
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
@@ -24,6 +25,8 @@ FloatArray = NDArray[np.float64]
 
 _STRETCH = 1.15
 """Steps may become this much longer before further neighbours share the detour."""
+_RUN_UP = 0.4
+"""Free steps before and after a collision that take part in the way round, as a share of the colliding ones."""
 _DETOUR = 1.5
 """How much longer than the shortest a way on the side where most of the track already is may be."""
 _WIDEN_ROUNDS = 8
@@ -202,7 +205,16 @@ def _spans(is_bad: NDArray[np.bool_], part: NDArray[np.intp], point: FloatArray,
             spans[-1] = _span(before.first, last, parts | before.parts, is_bad)
         else:
             spans.append(_span(first, last, parts, is_bad))
-    return tuple(spans)
+    return tuple(_with_run_up(spans, is_bad))
+
+
+def _with_run_up(spans: Sequence[_Span], is_bad: NDArray[np.bool_]) -> Iterator[_Span]:
+    """The spans with some free steps before and after, so that a way round turns off before it stands at the wall."""
+    for index, span in enumerate(spans):
+        reach = math.ceil(_RUN_UP * (span.last - span.first))
+        floor = 0 if index == 0 else (spans[index - 1].last + span.first + 1) // 2
+        ceiling = len(is_bad) - 1 if index + 1 == len(spans) else (span.last + spans[index + 1].first) // 2
+        yield _span(max(floor, span.first - reach), min(ceiling, span.last + reach), span.parts, is_bad)
 
 
 def _span(first: int, last: int, parts: frozenset[int], is_bad: NDArray[np.bool_]) -> _Span:

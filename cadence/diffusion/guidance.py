@@ -74,12 +74,12 @@ def clean_estimate_guidance(
     never more than strength · s / 2. Steps whose sigma allows it converge to feasible.
     """
     variance = scale_m.square()
-    tiny = torch.finfo(position_m.dtype).tiny
     for _ in range(num_steps):
         gradient = torch.zeros_like(position_m)
         for constraint in constraints:
             gradient = gradient + constraint.gradient(position_m)
         squared = gradient.square().sum(dim=-1, keepdim=True)
-        gain = variance / (variance + squared).clamp_min(tiny)
+        # As s² / (s² + g²), without infinity over infinity where nothing is known, and exactly zero where s is.
+        gain = (variance > 0) / (1 + squared / variance.clamp_min(torch.finfo(variance.dtype).tiny))
         position_m = position_m - strength * gain * gradient
     return position_m
