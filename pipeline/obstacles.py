@@ -40,7 +40,13 @@ Note = Callable[[str], object]
 
 @dataclass(frozen=True)
 class CircleSource:
-    """A circle about (x_m, y_m) in the mission frame, or about (latitude_deg, longitude_deg)."""
+    """A circle in the mission frame or on the earth.
+
+    radius_m  radius in metres
+    x_m, y_m  centre in the mission frame; or
+    latitude_deg, longitude_deg  centre on the earth
+    name      for people
+    """
 
     radius_m: float
     x_m: float | None = None

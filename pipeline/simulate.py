@@ -31,12 +31,18 @@ VERSION = 1
 class SimulateConfig:
     """What to simulate, and how to write it.
 
+    world           the only one so far
+    seed            of the whole series of episodes
     num_episodes, first_index  episodes first_index ... first_index + num_episodes - 1 of `seed`; an episode depends on
                                nothing but its index, the seed and the settings below
+    num_agents      targets
+    duration_s, step_s  length of an episode, and time between truth samples
     detection_rate  mean share of steps with a detection of an agent (episodes differ widely); sets the sensors' ranges
     line_of_sight   whether land hides targets from the sensors at sea level
     encoding        protobuf, json or cdr; protobuf logs in metres hold JSON detections (no Foxglove type has a covariance)
-    georeferenced   positions as latitude and longitude about (latitude_deg, longitude_deg)
+    georeferenced   positions as latitude and longitude
+    latitude_deg, longitude_deg  of the middle of the map, for georeferenced logs
+    frame_id        name of the frame in the messages
     start_time_s    Unix time of the first message
     """
 
