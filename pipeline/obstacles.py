@@ -65,7 +65,12 @@ class CircleSource:
 
 @dataclass(frozen=True)
 class PolygonSource:
-    """A polygon: its corners [x, y] in metres of the mission frame or [latitude, longitude] in degrees, and holes likewise."""
+    """A polygon in the mission frame or on the earth.
+
+    points_m, holes_m      corners [x, y] in metres of the mission frame, and of its holes; or
+    points_deg, holes_deg  corners [latitude, longitude] in degrees, and of its holes
+    name                   for people
+    """
 
     points_m: Points = ()
     holes_m: tuple[Points, ...] = ()
