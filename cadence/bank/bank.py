@@ -112,6 +112,10 @@ class Bank:
         """Joint samples of the bank itself: the rival and release gate of the diffusion model."""
         return scatter_hypotheses(self.posterior(windows, num_hypotheses).sample_m, windows)
 
+    def length_m(self, step_s: float) -> float:
+        """One step length: the way at the log's typical speed in a step."""
+        return self._speed() * step_s
+
     def _speed(self) -> float:
         if self.speed_mps is None:
             raise ValueError("Bank: fit() it to the detections of a log first; it has no speed unit")

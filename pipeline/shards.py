@@ -1,0 +1,49 @@
+"""Training windows on disk: numbered shards, each a function of its seed alone, made once and kept.
+
+A killed training finds its shards again; a shard is written beside its name and renamed, so half of one is never read.
+"""
+
+import dataclasses
+import os
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+
+from cadence.diffusion.residual import ResidualContext
+from cadence.training.synthetic import ResidualWindows, SyntheticConfig, synthesise
+
+SCENARIOS_PER_SHARD = 32
+
+_CONTEXT_FIELDS = tuple(field.name for field in dataclasses.fields(ResidualContext))
+
+
+def synthetic_shard(folder: Path, config: SyntheticConfig, seed: int, index: int) -> ResidualWindows:
+    """Shard `index` of the stream that `seed` starts: read from `folder`, or made and left there."""
+    path = folder / f"synthetic-{seed}-{index:05d}.safetensors"
+    found = read_windows(path)
+    if found is None:
+        found = synthesise(config, seed * 1_000_003 + index, SCENARIOS_PER_SHARD)
+        write_windows(found, path)
+    return found
+
+
+def write_windows(windows: ResidualWindows, path: Path) -> None:
+    """Write training windows; atomic."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    tensors = {f"context.{name}": getattr(windows.context, name).contiguous() for name in _CONTEXT_FIELDS}
+    tensors |= {"residual": windows.residual.contiguous(), "sample": windows.sample.to(torch.float16).contiguous()}
+    partial = path.with_suffix(f".{os.getpid()}.part")
+    save_file(tensors, partial)
+    os.replace(partial, path)
+
+
+def read_windows(path: Path) -> ResidualWindows | None:
+    """Training windows written before; None where there are none that can be read."""
+    try:
+        tensors = load_file(path)
+        context = ResidualContext(*(tensors[f"context.{name}"] for name in _CONTEXT_FIELDS))
+        return ResidualWindows(context, tensors["residual"], tensors["sample"].float())
+    except (OSError, SafetensorError, KeyError):
+        return None
