@@ -1,0 +1,1 @@
+"""Networks: the temporal U-Net and the encoder of detections."""

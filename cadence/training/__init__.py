@@ -1,0 +1,1 @@
+"""Training: windows with known truth, and the loop."""

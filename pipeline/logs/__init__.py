@@ -1,0 +1,1 @@
+"""The MCAP boundary: reading what can be trusted, writing what can be checked."""
