@@ -1,5 +1,6 @@
 """Uncertainty over time as SVG text: a row an agent, detections as ticks beneath."""
 
+import itertools
 import math
 from collections.abc import Sequence
 from html import escape
@@ -116,13 +117,15 @@ def _chart_row(
 
 def _silent_spans(x: Floats, found: Sequence[int | None]) -> list[tuple[float, float]]:
     """Where windows have no hypotheses: from halfway to the window before to halfway to the window after."""
-    half = float(np.median(np.diff(x))) / 2 if len(x) > 1 else 4.0
+    if len(x) == 0:
+        return []
+    middles = (x[1:] + x[:-1]) / 2
+    edges = np.concatenate([[max(x[0] - 4, LABEL_WIDTH)], middles, [min(x[-1] + 4, CHART_WIDTH - MARGIN_RIGHT)]])
     spans: list[tuple[float, float]] = []
-    for at, index in zip(x.tolist(), found, strict=True):
-        if index is None:
-            joins = bool(spans) and at - half <= spans[-1][1] + 0.1
-            first = spans.pop()[0] if joins else max(at - half, LABEL_WIDTH)
-            spans.append((first, min(at + half, CHART_WIDTH - MARGIN_RIGHT)))
+    for index, (first, last) in enumerate(itertools.pairwise(edges.tolist())):
+        if found[index] is None:
+            joins = index > 0 and found[index - 1] is None
+            spans.append((spans.pop()[0] if joins else first, last))
     return spans
 
 

@@ -87,11 +87,15 @@ class Clock:
 
 def duration(seconds: float) -> str:
     """A length of time for people: 12.3 s, 3 min 18 s, 2 h 05 min, 3 d 04 h."""
-    if seconds < 60:
-        return f"{seconds:.3g} s"
     whole = round(seconds)
+    if whole < 60:
+        return f"{seconds:.3g} s"
     if whole < 3600:
-        return f"{whole // 60} min {whole % 60:02} s"
+        return _pair(whole // 60, "min", whole % 60, "s")
     if whole < 86_400:
-        return f"{whole // 3600} h {whole // 60 % 60:02} min"
-    return f"{whole // 86_400} d {whole // 3600 % 24:02} h"
+        return _pair(whole // 3600, "h", whole // 60 % 60, "min")
+    return _pair(whole // 86_400, "d", whole // 3600 % 24, "h")
+
+
+def _pair(large: int, large_unit: str, small: int, small_unit: str) -> str:
+    return f"{large} {large_unit}" + (f" {small:02} {small_unit}" if small else "")

@@ -85,7 +85,8 @@ def _measure(track_m: Floats, first: int, last: int, deviation: Floats) -> None:
         return
     share = (np.arange(first + 1, last) - first)[:, None] / (last - first)
     chord = track_m[:, first, None] + share * (track_m[:, last] - track_m[:, first])[:, None]
-    deviation[first + 1 : last] = np.hypot(*np.moveaxis(track_m[:, first + 1 : last] - chord, -1, 0)).max(axis=0)
+    away = track_m[:, first + 1 : last] - chord
+    deviation[first + 1 : last] = np.hypot(away[..., 0], away[..., 1]).max(axis=0)
 
 
 @dataclass(frozen=True, eq=False)

@@ -409,7 +409,7 @@
     moment.textContent = words; slider.setAttribute("aria-valuetext", words);
     cellTexts.forEach((text, agent) => {
       const [status, count, age, spread] = (data.cells[state.window] ?? [])[agent] ?? ["", 0, null, null];
-      text.textContent = status && spread === null ? status.replaceAll("_", " ") : count === 0 && spread === null ? "no detections" : `±${metres(spread ?? 0)}, seen ${period(age ?? 0)} ago`;
+      text.textContent = status && spread === null ? status.replaceAll("_", " ") : count === 0 && spread === null ? "no detections" : `±${metres(spread ?? 0)}, ${period(age ?? 0)}`;
     });
     for (const chart of document.querySelectorAll("svg.chart")) {
       const x = (Number(chart.dataset.left) + seconds * Number(chart.dataset.scale)).toFixed(1), cursor = chart.querySelector(".cursor");

@@ -1,18 +1,19 @@
 """Sections on the hypotheses: chosen moments, uncertainty over time, windows that need attention."""
 
-from collections.abc import Sequence
+import re
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from pipeline.report.analysis import Analysis, Moment, find_troubles, shape_of
+from pipeline.report.analysis import Analysis, Moment, Trouble, find_troubles, shape_of
 from pipeline.report.charts import SpreadAxis, TimeAxis, uncertainty_chart
 from pipeline.report.clock import Clock, duration
 from pipeline.report.lengths import metres
 from pipeline.report.maps import moment_map
 from pipeline.report.markup import label, legend, section, table, text
-from pipeline.report.mission import Mission
+from pipeline.report.mission import Mission, WindowRow
 
-MAX_TROUBLES = 100
+OPEN_ROWS, MAX_ROWS, MAX_RUNS = 10, 300, 4
 OPEN_CHART_ROWS, MAX_CHART_ROWS = 8, 60
 
 
@@ -78,24 +79,37 @@ def _ranked_agents(mission: Mission, analysis: Analysis) -> tuple[list[int], flo
 
 
 def trouble_section(mission: Mission) -> str:
-    """Windows with a status other than ok, and what to do about them."""
+    """Windows with a status other than ok: a table for each piece of advice, a row an agent."""
     troubles = find_troubles(mission)
     if not troubles:
         return section("Windows that need attention", "<p>None: every window of every agent has status ok.</p>")
-    clock = Clock(mission.start_ns, mission.end_ns)
-    rows = []
-    for trouble in troubles[:MAX_TROUBLES]:
-        ends = [trouble.first] if trouble.count == 1 else [trouble.first, trouble.last]
-        when, number = (
-            " to ".join(words) for words in zip(*((clock.moment(row.origin_ns), str(row.window)) for row in ends), strict=True)
-        )
-        cells = (mission.agents[trouble.agent], number, when)
-        rows.append([*map(text, cells), label(trouble.status), text(trouble.advice)])
-    content = table(["agent", "windows", "origin", "status", "what to do"], rows)
-    if len(troubles) > MAX_TROUBLES:
-        content += f'<p class="note">{len(troubles) - MAX_TROUBLES} more rows are in windows.parquet.</p>'
+    kinds: dict[tuple[str, str], dict[int, list[Trouble]]] = {}
+    for trouble in troubles:
+        # Advice that differs only in its numbers is one piece of advice; the first stands for all.
+        kind = (trouble.status, re.sub(r"[0-9][0-9.,]*", "0", trouble.advice))
+        kinds.setdefault(kind, {}).setdefault(trouble.agent, []).append(trouble)
+    content = "".join(_trouble_table(mission, runs) for runs in kinds.values())
     bad = sum(trouble.count for trouble in troubles)
-    lead = (
-        f"{bad:,} of {len(mission.rows):,} pairs of a window and an agent are not ok; a row is a run of windows of one agent."
-    )
+    lead = f"{bad:,} of the {len(mission.rows):,} pairs of a window and an agent have a status other than ok."
     return section("Windows that need attention", content, lead)
+
+
+def _trouble_table(mission: Mission, runs: Mapping[int, Sequence[Trouble]]) -> str:
+    first = next(iter(runs.values()))[0]
+    clock = Clock(mission.start_ns, mission.end_ns)
+    heads, rows = ["agent", "count", "windows", "origins"], []
+    for agent, found in sorted(runs.items()):
+        words = [" to ".join(clock.moment(row.origin_ns) for row in _ends(trouble)) for trouble in found]
+        spans = ", ".join(words[:MAX_RUNS]) + (f" and {len(words) - MAX_RUNS} more spans" if len(words) > MAX_RUNS else "")
+        numbers = ", ".join(" to ".join(str(row.window) for row in _ends(trouble)) for trouble in found[:MAX_RUNS])
+        numbers += ", …" if len(found) > MAX_RUNS else ""
+        rows.append([text(mission.agents[agent]), str(sum(trouble.count for trouble in found)), text(numbers), text(spans)])
+    body = table(heads, rows[:OPEN_ROWS], numeric=(1,))
+    if len(rows) > OPEN_ROWS:
+        rest = table(heads, rows[OPEN_ROWS:MAX_ROWS], numeric=(1,))
+        body += f"<details><summary>{len(rows) - OPEN_ROWS} more agents</summary>{rest}</details>"
+    return f"<h3>{label(first.status.capitalize())}</h3><p>{text(first.advice)}</p>{body}"
+
+
+def _ends(trouble: Trouble) -> list[WindowRow]:
+    return [trouble.first] if trouble.count == 1 else [trouble.first, trouble.last]
