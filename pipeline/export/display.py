@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.export.playback import LiveAgent, Tick
+from pipeline.export.playback import LiveAgent, Scene
 from pipeline.logs.scene import Entity, Label, Lines, LineType, Spheres, round_positions
 
 Float64s = npt.NDArray[np.float64]
@@ -58,13 +58,28 @@ class Style:
         return np.concatenate([flat, np.full((*flat.shape[:-1], 1), self.z_m)], axis=-1)
 
 
-def scene_entities(tick: Tick, marks: Sequence[Marks], style: Style) -> list[Entity]:
-    """Everything to be seen at a tick: an entity an agent that is live, and one for each agent's detections so far."""
-    if tick.scene is None:
+@dataclass(frozen=True, eq=False)
+class Drawing:
+    """What stays the same from tick to tick while a scene is shown: the lines of each live agent."""
+
+    scene: Scene
+    lines: tuple[tuple[Lines, ...], ...]
+
+
+def draw(scene: Scene, style: Style) -> Drawing:
+    """The drawing of a scene."""
+    lines = tuple(_hypothesis_lines(live, style.color(live.agent.agent_id), style) for live in scene.live)
+    return Drawing(scene, lines)
+
+
+def scene_entities(drawing: Drawing | None, time_ns: int, marks: Sequence[Marks], style: Style) -> list[Entity]:
+    """Everything to be seen at a time: an entity an agent that is live, and one for each agent's detections so far."""
+    if drawing is None:
         return []
-    entities = [_agent_entity(live, tick.time_ns, style) for live in tick.scene.live]
+    scene = drawing.scene
+    entities = [_agent_entity(live, lines, time_ns, style) for live, lines in zip(scene.live, drawing.lines, strict=True)]
     for found in marks:
-        first, last = np.searchsorted(found.time_ns, [tick.scene.start_ns, tick.time_ns + 1])
+        first, last = np.searchsorted(found.time_ns, [scene.start_ns, time_ns + 1])
         first = max(first, last - _MAX_MARKS)
         if first < last:
             spheres = Spheres(style.place(found.position_m[first:last]), style.extent_m * 0.006, style.color(found.agent_id))
@@ -72,12 +87,12 @@ def scene_entities(tick: Tick, marks: Sequence[Marks], style: Style) -> list[Ent
     return entities
 
 
-def _agent_entity(live: LiveAgent, time_ns: int, style: Style) -> Entity:
+def _agent_entity(live: LiveAgent, lines: tuple[Lines, ...], time_ns: int, style: Style) -> Entity:
     color = style.color(live.agent.agent_id)
     now_m = style.place(live.weight @ live.at(time_ns))
     return Entity(
         f"agent/{live.agent.agent_id}",
-        lines=_hypothesis_lines(live, color, style),
+        lines=lines,
         spheres=(Spheres(now_m[None], style.extent_m * 0.012, np.array([*color[:3], 0.8])),),
         labels=(Label(now_m + np.array([0.0, style.extent_m * 0.015, 0.0]), live.agent.agent_id, color),),
     )

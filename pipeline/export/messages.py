@@ -131,7 +131,7 @@ def _add_state(state: Any, live: LiveAgent, now_ns: int) -> None:
     state.horizon_spread_m = numbers.spread_m(live.position_m[:, -1], live.weight)
     state.speed_mps = numbers.speed_mps(live, now_ns)
     state.entropy = numbers.weight_entropy(live.weight)
-    state.num_modes = numbers.count_modes(live.position_m[:, -1], live.weight)
+    state.num_modes = live.num_modes
 
 
 def encode_detection(row: dict[str, Any], frame: Frame, time_ns: int) -> bytes:

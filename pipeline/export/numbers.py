@@ -1,13 +1,15 @@
 """Numbers that describe weighted hypotheses: spread, agreement, modes, envelopes, occupancy."""
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
-from pipeline.export.playback import LiveAgent
+if TYPE_CHECKING:
+    from pipeline.export.playback import LiveAgent
 
 Float64s = npt.NDArray[np.float64]
 
@@ -36,7 +38,7 @@ def covariance_m2(position_m: Float64s, weight: Float64s) -> Float64s:
     return np.asarray(np.einsum("k,ki,kj->ij", weight, away, away))
 
 
-def speed_mps(live: LiveAgent, time_ns: int) -> float:
+def speed_mps(live: "LiveAgent", time_ns: int) -> float:
     """Weighted mean of the hypotheses' speeds in the step around a time; 0 without a second step."""
     window = live.window
     if window.num_steps < 2:
@@ -74,7 +76,7 @@ def weighted_quantile(value: Float64s, weight: Float64s, share: float) -> Float6
     return np.asarray(np.take_along_axis(np.take_along_axis(value, order, 0), index[None], 0)[0])
 
 
-def future_occupancy(live: tuple[LiveAgent, ...], max_cells: int) -> Occupancy | None:
+def future_occupancy(live: tuple["LiveAgent", ...], max_cells: int) -> Occupancy | None:
     """How likely each place is to be visited between the origin and the end of the future; None without a live agent."""
     futures = [agent.position_m[:, agent.window.origin_index :] for agent in live]
     if not futures:

@@ -9,6 +9,7 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
+from pipeline.export import numbers
 from pipeline.results import AgentHypotheses, MissionHypotheses, WindowHypotheses
 
 Float64s = npt.NDArray[np.float64]
@@ -31,6 +32,11 @@ class LiveAgent:
     def mean_m(self) -> Float64s:
         """Weighted mean track [T, 2]."""
         return np.asarray(np.einsum("k,ktd->td", self.weight, self.position_m))
+
+    @cached_property
+    def num_modes(self) -> int:
+        """Separate groups of hypotheses at the end of the future."""
+        return numbers.count_modes(self.position_m[:, -1], self.weight)
 
     def at(self, time_ns: int) -> Float64s:
         """Positions [K, 2] at a time: linear between steps, the first or last step outside of them."""

@@ -14,7 +14,7 @@ import pyarrow as pa
 from cadence.errors import InputError
 from pipeline.config import config_as_dict
 from pipeline.export import maps, messages
-from pipeline.export.display import Marks, Style, obstacle_entities, scene_entities
+from pipeline.export.display import Drawing, Marks, Style, draw, obstacle_entities, scene_entities
 from pipeline.export.playback import Scene, Tick, build_scenes, plan_ticks
 from pipeline.ingest import CATALOGUE_NAME, Catalogue, read_catalogue
 from pipeline.layouts import build_layout, build_legacy_layout
@@ -241,6 +241,7 @@ def _in_order(mission: _Mission, config: ExportConfig) -> Iterator[_Message]:
     on_map = _map_ticks(mission, config)
     if moments:
         yield from _static(mission, moments[0][0] + mission.clock_offset_ns)
+    drawing: Drawing | None = None
     for moment_ns, kind, index in moments:
         time_ns = moment_ns + mission.clock_offset_ns
         if kind == 0:
@@ -248,8 +249,12 @@ def _in_order(mission: _Mission, config: ExportConfig) -> Iterator[_Message]:
         elif kind == 1:
             yield from _detection(mission, rows[index], time_ns)
         else:
-            is_new = index == 0 or ticks[index].scene is not ticks[index - 1].scene
-            yield from _tick(mission, config, ticks[index], time_ns, is_new, index in on_map)
+            tick = ticks[index]
+            if index == 0 or tick.scene is not ticks[index - 1].scene:
+                drawing = draw(tick.scene, mission.style) if tick.scene else None
+                data = messages.encode_occupancy(tick, frame, time_ns, config.occupancy_cells, mission.style.z_m)
+                yield time_ns, channels.OCCUPANCY, data
+            yield from _tick(mission, tick, drawing, time_ns, index in on_map)
 
 
 def _static(mission: _Mission, time_ns: int) -> Iterator[_Message]:
@@ -271,16 +276,11 @@ def _detection(mission: _Mission, row: dict[str, Any], time_ns: int) -> Iterator
         yield time_ns, channels.detection_fix_channel(row["agent_id"]), data
 
 
-def _tick(
-    mission: _Mission, config: ExportConfig, tick: Tick, time_ns: int, is_new: bool, is_on_map: bool
-) -> Iterator[_Message]:
-    """The messages of a tick; those that say the same until the next window only where `is_new`."""
+def _tick(mission: _Mission, tick: Tick, drawing: Drawing | None, time_ns: int, is_on_map: bool) -> Iterator[_Message]:
     frame, style = mission.hypotheses.frame, mission.style
-    yield time_ns, channels.SCENE, encode_scene(time_ns, frame.frame_id, scene_entities(tick, mission.marks, style))
+    entities = scene_entities(drawing, tick.time_ns, mission.marks, style)
+    yield time_ns, channels.SCENE, encode_scene(time_ns, frame.frame_id, entities)
     yield time_ns, channels.AGENTS, messages.encode_agents(tick, time_ns)
-    if is_new:
-        data = messages.encode_occupancy(tick, frame, time_ns, config.occupancy_cells, style.z_m)
-        yield time_ns, channels.OCCUPANCY, data
     if frame.is_georeferenced and tick.scene is not None:
         for live in tick.scene.live:
             data = maps.encode_mean_fix(live, tick.time_ns, frame, style, time_ns)

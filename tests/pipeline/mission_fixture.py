@@ -118,7 +118,8 @@ def _hypotheses(rng: np.random.Generator, detections: pa.Table, num_hypotheses: 
             is_lost = agent == 1 and window == NUM_WINDOWS - 1
             path_m = true_position_m(agent, (origin_ns - START_NS) / 1e9 + offset_s) - DATUM_M
             growth_m = np.where(offset_s < 0, 6.0, 6.0 + 1.5 * np.maximum(offset_s, 0))[None, :, None]
-            position_m = (path_m + growth_m * rng.normal(0, 1, (num_hypotheses, 1, 2))).astype(np.float32)
+            wander_m = 0.3 * np.cumsum(rng.normal(0, 1, (num_hypotheses, NUM_STEPS, 2)), axis=1)
+            position_m = (path_m + growth_m * rng.normal(0, 1, (num_hypotheses, 1, 2)) + wander_m).astype(np.float32)
             common = {"window": window, "origin_ns": origin_ns, "agent_id": agent_id}
             spread_m = float(np.sqrt(np.sum(np.var(position_m[:, ORIGIN_INDEX], axis=0))))
             windows.append(
