@@ -82,7 +82,7 @@ def scene_entities(drawing: Drawing | None, time_ns: int, marks: Sequence[Marks]
         first, last = np.searchsorted(found.time_ns, [scene.start_ns, time_ns + 1])
         first = max(first, last - _MAX_MARKS)
         if first < last:
-            spheres = Spheres(style.place(found.position_m[first:last]), style.extent_m * 0.006, style.color(found.agent_id))
+            spheres = Spheres(style.place(found.position_m[first:last]), style.extent_m * 0.008, style.color(found.agent_id))
             entities.append(Entity(f"detections/{found.agent_id}", spheres=(spheres,)))
     return entities
 

@@ -156,6 +156,8 @@ def _read_obstacles(path: Path) -> list[dict[str, Any]]:
         obstacles = json.loads(path.read_text(encoding="utf-8"))["obstacles"]
         if not isinstance(obstacles, list):
             raise TypeError("obstacles is not a list")
+        if any(obstacle["kind"] not in ("circle", "polygon") for obstacle in obstacles):
+            raise ValueError("an obstacle is neither a circle nor a polygon")
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise InputError(f"{path}: cannot be read ({error}); run extract again with --force") from error
     return obstacles
