@@ -23,7 +23,20 @@ def stage_summary(result: StageResult) -> str:
     """What was done in one line, its counts and numbers in the next, then the files."""
     numbers = [_named(name, value) for name, value in result.summary.items() if type(value) in (int, float) and value]
     lines = [f"{result.stage}: {result.status}", *([f"  {', '.join(numbers)}"] if numbers else [])]
+    lines += score_lines(result.summary.get("scores", ()))
     return "\n".join(lines + [f"  {path}" for path in result.outputs])
+
+
+def score_lines(scores: Sequence[Mapping[str, Any]]) -> list[str]:
+    """The headline of `cadence evaluate` as a table: a row an estimator, a column a part and metric."""
+    columns = list(dict.fromkeys((str(score["part"]), str(score["metric"])) for score in scores))
+    values = {(score["estimator"], score["part"], score["metric"]): score["value"] for score in scores}
+    rows = [["", *(f"{part} {metric}" for part, metric in columns)]]
+    for estimator in dict.fromkeys(score["estimator"] for score in scores):
+        cells = [values.get((estimator, *column)) for column in columns]
+        rows.append([str(estimator), *("-" if cell is None else f"{cell:.4g}" for cell in cells)])
+    widths = [max(len(row[i]) for row in rows) for i in range(len(columns) + 1)]
+    return ["  " + "  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in rows if scores]
 
 
 def log_record(result: "LogResult") -> dict[str, Any]:

@@ -47,7 +47,7 @@ def write_log(
 ) -> Path:
     """Write `fixes` as foxglove.PoseInFrame (JSON) in the order given; `other_topics` carry a text that is no position."""
     with path.open("wb") as file:
-        writer = Writer(file, chunk_size=16_384, compression=compression)  # several chunks also in small logs
+        writer = Writer(file, chunk_size=4096, compression=compression)  # several chunks also in small logs
         writer.start(profile="", library="test")
         pose = writer.register_schema("foxglove.PoseInFrame", "jsonschema", json.dumps(POSE_IN_FRAME).encode())
         text = writer.register_schema("Note", "jsonschema", b'{"type":"object","properties":{"text":{"type":"string"}}}')

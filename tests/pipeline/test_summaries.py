@@ -6,7 +6,7 @@ from pathlib import Path
 from cadence.errors import InputError
 from pipeline.manifest import StageResult
 from pipeline.run import LogResult
-from pipeline.summaries import log_record, log_summary, stage_summary, to_json
+from pipeline.summaries import log_record, log_summary, score_lines, stage_summary, to_json
 
 INGEST = StageResult("ingest", "done", (Path("o/a/catalogue.json"),), {"num_messages": 5, "problems": ["cut off at 10:00"]})
 EXPORT = StageResult("export", "skipped", (Path("o/a/a.cadence.mcap"),), {"size_mb": 1.23456, "is_georeferenced": False})
@@ -35,3 +35,17 @@ def test_logs_for_programs():
         "stages": [{"stage": "ingest", "status": "done", "outputs": ["o/a/catalogue.json"], "summary": dict(INGEST.summary)}],
     }  # fmt: skip
     assert records[1]["error"] == {"message": "no", "exit_code": 3} and records[1]["stages"] == []
+
+
+def test_scores_as_a_table():
+    scores = [
+        {"estimator": "cadence", "part": "past", "metric": "ade_m", "value": 12.3456},
+        {"estimator": "cadence", "part": "future", "metric": "ade_m", "value": 100.0},
+        {"estimator": "hold", "part": "past", "metric": "ade_m", "value": None},
+    ]
+    assert score_lines(scores) == [
+        "           past ade_m  future ade_m",
+        "  cadence       12.35           100",
+        "     hold           -             -",
+    ]
+    assert score_lines([]) == []
