@@ -252,3 +252,30 @@ def share_of_steps(mission: Mission) -> float | None:
             seen += len(np.unique(step))
             total += int(step[-1]) + 1
     return seen / total if total else None
+
+
+SHARES = (1.0, 0.5, 0.25, 0.125)
+MAX_TURNS = 2.5
+"""Path length over the diagonal of its box beyond which drawn tracks are a ball of wool: a circle has 2.2."""
+
+
+def shown_share(mission: Mission) -> float:
+    """The largest of `SHARES` of a window's past and future whose tracks do not yet cover themselves again and again."""
+    fans = mission.fans[:: max(1, len(mission.fans) // 100)]
+    for share in SHARES:
+        path = diagonal = 0.0
+        for fan in fans:
+            first, last = shown_steps(fan, share)
+            track_m = fan.offset_m[int(fan.weight.argmax()), first : last + 1].astype(np.float64)
+            path += float(np.hypot(*np.diff(track_m, axis=0).T).sum())
+            diagonal += float(np.hypot(*np.ptp(track_m, axis=0)))
+        if path <= MAX_TURNS * diagonal:
+            return share
+    return SHARES[-1]
+
+
+def shown_steps(fan: Fan, share: float) -> tuple[int, int]:
+    """First and last step of a share of the past and of the future, at least one step of each that is there."""
+    last = fan.offset_m.shape[1] - 1
+    back, ahead = (int(np.ceil(share * steps)) for steps in (fan.origin_index, last - fan.origin_index))
+    return fan.origin_index - back, fan.origin_index + ahead

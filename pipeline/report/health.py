@@ -10,6 +10,13 @@ from pipeline.report.mission import Mission
 MAX_CHANNELS = 200
 MAX_ENTRIES = 50
 
+FACTS = {
+    "num_messages": "messages read",
+    "num_messages_expected": "messages that the recorder wrote",
+    "has_checksums": "checksums, to notice changed bytes",
+}
+"""Facts of the catalogue's health in words."""
+
 LEFT_OUT = {
     "collapsed": "simultaneous detections merged into others",
     "undecodable": "messages that cannot be decoded",
@@ -32,7 +39,8 @@ def health_section(mission: Mission) -> str:
     health = health if isinstance(health, dict) else {}
     content = _verdict(health) + _problems(health) + _lost_spans(mission, health)
     known = {"is_complete", "problems", "lost_spans_ns"}
-    rows = [(label(key), text(value)) for key, value in flatten(health) if key.split(".")[0] not in known]
+    rows = [(text(words), text(health[key])) for key, words in FACTS.items() if key in health]
+    rows += [(label(key), text(value)) for key, value in flatten(health) if key.split(".")[0] not in {*known, *FACTS}]
     left = f"<div><h3>Log</h3>{pairs(rows)}</div>" if rows else ""
     summary = mission.manifests.get("extract", {}).get("summary") or {}
     rows = _extraction(summary)
@@ -43,7 +51,10 @@ def health_section(mission: Mission) -> str:
 
 def _extraction(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
     """What extract counted: what was left out in words, the rest by its name."""
-    rows = [(text(words), text(summary[key])) for key, words in LEFT_OUT.items() if key in summary]
+    counted = {words: summary[key] for key, words in LEFT_OUT.items() if key in summary}
+    rows = [(text(words), text(count)) for words, count in counted.items() if count]
+    if counted and not rows:
+        rows = [("left out", "nothing")]
     # The log's own part of the page tells of these already.
     known = {*LEFT_OUT, "lost_spans_ns", "is_complete", "frame"}
     return [(label(key), text(value)) for key, value in flatten(summary)[:MAX_ENTRIES] if key.split(".")[0] not in known] + rows

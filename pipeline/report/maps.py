@@ -14,7 +14,6 @@ from pipeline.report.mission import Fan, Floats, Mission, Obstacle
 
 MAP_WIDTH, MAP_HEIGHT = 400, 300
 MAX_STATIC_HYPOTHESES = 40
-MAX_STATIC_POINTS = 250
 
 
 class View:
@@ -32,39 +31,57 @@ class View:
         return np.asarray(shifted * (1, -1) + (MAP_WIDTH / 2, MAP_HEIGHT / 2))
 
 
-def moment_map(mission: Mission, fan: Fan, shape: FanShape, label: str) -> str:
-    """The map of one fan: obstacles, truth, hypotheses, mean, detections and the place at the origin."""
-    first_ns, last_ns = int(fan.time_ns[0]), int(fan.time_ns[-1])
+def moment_map(mission: Mission, fan: Fan, shape: FanShape, steps: tuple[int, int], label: str) -> str:
+    """The map of one fan from the first to the last of `steps`.
+
+    Obstacles, truth, hypotheses, mean, detections and the place of the mean at the origin.
+    """
+    shown, now = slice(steps[0], steps[1] + 1), fan.origin_index - steps[0]
+    first_ns, last_ns = int(fan.time_ns[steps[0]]), int(fan.time_ns[steps[1]])
     detections = mission.detections.of(fan.agent).between(first_ns, last_ns)
-    track_m = fan.offset_m.astype(np.float64) + fan.datum_m
-    heaviest = np.argsort(-fan.weight, kind="stable")[:MAX_STATIC_HYPOTHESES]
-    # A single stray hypothesis must not shrink all others to a dot.
-    low, high = np.percentile(track_m.reshape(-1, 2), [1, 99], axis=0)
-    view = View(np.concatenate([low[None], high[None], shape.mean_m, detections.position_m]))
-    now = fan.origin_index
+    track_m = fan.offset_m[:, shown].astype(np.float64) + fan.datum_m
+    mean_m = shape.mean_m[shown]
+    # A few stray hypotheses must not shrink all others to a dot; they are cut at the border.
+    low, high = np.percentile(track_m, [4, 96], axis=(0, 1))
+    view = View(np.concatenate([low[None], high[None], mean_m, detections.position_m]))
     parts = [_obstacle(item, view) for item in mission.obstacles]
     if mission.truth is not None:
         truth = mission.truth.of(fan.agent).between(first_ns, last_ns)
         parts.append(_line(view.pixels(truth.position_m), "truth"))
-    strongest = float(fan.weight.max())
-    base = min(0.8, max(0.16, 2.4 / math.sqrt(len(heaviest))))
-    for k in sorted(heaviest.tolist()):
-        opacity = max(0.05, base * float(fan.weight[k]) / strongest)
-        pixels = view.pixels(track_m[k])
-        parts.append(_line(pixels[: now + 1], "past", opacity))
-        parts.append(_line(pixels[now:], "future", opacity))
-    mean = view.pixels(shape.mean_m)
+    parts += _hypotheses(view.pixels(track_m), fan.weight, now)
+    mean = view.pixels(mean_m)
     parts += [_line(mean[: now + 1], "past mean"), _line(mean[now:], "future mean")]
-    age = np.clip((fan.origin_ns - detections.time_ns) / max(fan.origin_ns - first_ns, 1), None, 1)
-    for (x, y), share in list(zip(view.pixels(detections.position_m), age, strict=True))[-MAX_STATIC_POINTS:]:
-        if share < 0:
-            parts.append(f'<circle class="later" cx="{x:.1f}" cy="{y:.1f}" r="3"/>')
-        else:
-            parts.append(f'<circle class="detection" cx="{x:.1f}" cy="{y:.1f}" r="3.2" fill-opacity="{1 - 0.75 * share:.2f}"/>')
+    age = (fan.origin_ns - detections.time_ns) / max(fan.origin_ns - first_ns, 1)
+    parts += _dots(view.pixels(detections.position_m), age)
     parts.append(f'<circle class="now" cx="{mean[now][0]:.1f}" cy="{mean[now][1]:.1f}" r="6"/>')
     parts += [scale_bar(view.pixel_per_m), NORTH_ARROW]
     opening = f'<svg class="map" viewBox="0 0 {MAP_WIDTH} {MAP_HEIGHT}" role="img" aria-label="{escape(label)}">'
     return f"{opening}{''.join(parts)}</svg>"
+
+
+def _hypotheses(pixels: Floats, weight: Floats, now: int) -> list[str]:
+    """The heaviest hypotheses [K, T, 2], stronger where heavier; step `now` is the origin."""
+    heaviest = np.sort(np.argsort(-weight, kind="stable")[:MAX_STATIC_HYPOTHESES])
+    base = min(0.8, max(0.16, 2.4 / math.sqrt(len(heaviest))))
+    parts = []
+    for k in heaviest.tolist():
+        opacity = max(0.05, base * float(weight[k] / weight.max()))
+        parts += [_line(pixels[k, : now + 1], "past", opacity), _line(pixels[k, now:], "future", opacity)]
+    return parts
+
+
+def _dots(pixels: Floats, age: Floats) -> list[str]:
+    """Detections of [N, 2] pixels, fading with age [N] (negative: after the origin); of those that cover each other one."""
+    parts: list[str] = []
+    latest: tuple[float, float, bool] | None = None
+    for (x, y), share in zip(pixels.tolist(), age.tolist(), strict=True):
+        is_later = share < 0
+        if latest is not None and latest[2] == is_later and math.hypot(x - latest[0], y - latest[1]) < 5:
+            continue
+        latest = (x, y, is_later)
+        look = 'class="later"' if is_later else f'class="detection" fill-opacity="{1 - 0.75 * min(share, 1):.2f}"'
+        parts.append(f'<circle {look} cx="{x:.1f}" cy="{y:.1f}" r="3.2"/>')
+    return parts
 
 
 NORTH_ARROW = (

@@ -19,6 +19,8 @@ def text(value: object) -> str:
         shown = f"{value:.6g}" if math.isfinite(value) else "not a number"
     elif isinstance(value, str):
         shown = value
+    elif isinstance(value, list) and value and all(isinstance(item, str) for item in value):
+        shown = ", ".join(value)
     else:
         shown = str(value) if isinstance(value, int) else json.dumps(value, ensure_ascii=False, sort_keys=True)
     if len(shown) > MAX_VALUE_CHARACTERS:
@@ -27,8 +29,12 @@ def text(value: object) -> str:
 
 
 def label(key: object) -> str:
-    """A JSON key as escaped words."""
-    return text(str(key).replace("_", " "))
+    """A JSON key as escaped words, its unit in brackets."""
+    words = str(key).removeprefix("num_")
+    for unit in ("s", "ns", "m", "mps", "hz", "deg"):
+        if words.endswith(f"_{unit}"):
+            words = f"{words.removesuffix(f'_{unit}')} ({unit})"
+    return text(words.replace("_", " "))
 
 
 def section(title: str, content: str, lead: str = "", kind: str = "") -> str:

@@ -7,9 +7,10 @@
 
   // ---- data ----------------------------------------------------------------
   const bytes = (text) => Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0)).buffer;
+  const f8 = (text) => new Float64Array(bytes(text));
   const f4 = (text) => new Float32Array(bytes(text));
   const i2 = (text) => new Int16Array(bytes(text));
-  const readPoints = (code) => code && { time: f4(code.time_s), owner: i2(code.owner), position: f4(code.position_m) };
+  const readPoints = (code) => code && { time: f8(code.time_s), owner: i2(code.owner), position: f4(code.position_m) };
   const detections = readPoints(data.detections), truth = readPoints(data.truth), poses = readPoints(data.poses);
 
   const fans = readFans(data.fans);
@@ -46,7 +47,7 @@
   // ---- state ---------------------------------------------------------------
   const canvas = byId("map"), pen = canvas.getContext("2d");
   const slider = byId("window"), readout = byId("readout"), moment = byId("moment"), playButton = byId("play");
-  const state = { window: 0, x: 0, y: 0, scale: 1, agents: new Set(data.agents.keys()), timer: 0, isPrinting: false };
+  const state = { window: 0, x: 0, y: 0, scale: 1, agents: new Set(data.agents.keys()), timer: 0, isPrinting: false, span: data.shown_share };
   const layers = {};
   for (const box of document.querySelectorAll("[data-layer]")) {
     layers[box.dataset.layer] = box.checked;
@@ -91,7 +92,8 @@
     box.low = Math.min(box.low, y); box.high = Math.max(box.high, y);
   }
   function growByFan(box, fan) {
-    for (let s = 0; s < fan.numS; s++) {
+    const [start, end] = shownVertices(fan);
+    for (let s = start; s <= end; s++) {
       const at = 6 * s, reach = Math.min(fan.summary[at + 2] * fan.scale * 0.7, 1e9);
       const x = fan.x + fan.summary[at] * fan.scale, y = fan.y + fan.summary[at + 1] * fan.scale;
       grow(box, x - reach, y - reach); grow(box, x + reach, y + reach);
@@ -110,8 +112,8 @@
       if (points) for (let i = 0; i < points.time.length; i++) grow(box, points.position[2 * i], points.position[2 * i + 1]);
     }
     for (const fan of fans) {
-      const at = 6 * fan.now;
-      grow(box, fan.x + fan.summary[at] * fan.scale, fan.y + fan.summary[at + 1] * fan.scale);
+      const [start, end] = shownVertices(fan);
+      for (let at = 6 * start; at <= 6 * end; at += 6) grow(box, fan.x + fan.summary[at] * fan.scale, fan.y + fan.summary[at + 1] * fan.scale);
     }
     show(box);
   }
@@ -142,21 +144,26 @@
 
   // Paths in metres, made when a fan is first drawn: the canvas scales them.
   function pathsOf(fan) {
-    if (fan.paths) return fan.paths;
-    const lines = { past: [], future: [] };
-    for (let k = 0; k < fan.numK; k++) {
-      const at = (s) => [fan.x + fan.hypothesis[2 * (k * fan.numS + s)] * fan.scale, fan.y + fan.hypothesis[2 * (k * fan.numS + s) + 1] * fan.scale];
-      lines.past.push(line(at, 0, fan.now)); lines.future.push(line(at, fan.now, fan.numS - 1));
-    }
+    if (fan.paths && fan.paths.span === state.span) return fan.paths;
+    const [start, end] = shownVertices(fan), sides = { past: [start, fan.now], future: [fan.now, end] };
     const mean = (s) => [fan.x + fan.summary[6 * s] * fan.scale, fan.y + fan.summary[6 * s + 1] * fan.scale];
-    const sides = { past: [0, fan.now], future: [fan.now, fan.numS - 1] };
-    fan.paths = { lines, mean: {}, outer: {}, inner: {} };
+    fan.paths = { span: state.span, lines: {}, mean: {}, outer: {}, inner: {} };
     for (const [side, [first, last]] of Object.entries(sides)) {
+      fan.paths.lines[side] = Array.from({ length: fan.numK }, (_, k) => line(
+        (s) => [fan.x + fan.hypothesis[2 * (k * fan.numS + s)] * fan.scale, fan.y + fan.hypothesis[2 * (k * fan.numS + s) + 1] * fan.scale], first, last));
       fan.paths.mean[side] = line(mean, first, last);
       fan.paths.outer[side] = envelope(fan, first, last, false);
       fan.paths.inner[side] = envelope(fan, first, last, true);
     }
     return fan.paths;
+  }
+  // First and last vertex within the shown part of the window, or the next ones outside it.
+  function shownVertices(fan) {
+    const low = data.origin_index * (1 - state.span), high = data.origin_index + (data.num_steps - 1 - data.origin_index) * state.span;
+    let start = fan.now, end = fan.now;
+    while (start > 0 && fan.steps[start] > low) start--;
+    while (end < fan.numS - 1 && fan.steps[end] < high) end++;
+    return [start, end];
   }
   function line(at, first, last) {
     const path = new Path2D();
@@ -290,9 +297,11 @@
     pen.setLineDash([]);
   }
 
-  const span = () => {
+  const backSeconds = (share) => share * data.origin_index * data.step_s;
+  const aheadSeconds = (share) => share * (data.num_steps - 1 - data.origin_index) * data.step_s;
+  const shownTimes = () => {
     const now = data.origin_s[state.window];
-    return { now, first: now - data.origin_index * data.step_s, last: now + (data.num_steps - 1 - data.origin_index) * data.step_s };
+    return { now, first: now - backSeconds(state.span), last: now + aheadSeconds(state.span) };
   };
   function drawTrack(points, indices, first, last) {
     pen.beginPath();
@@ -306,14 +315,14 @@
   }
   function drawTruth(colour) {
     if (!truth) return;
-    const { first, last } = span();
+    const { first, last } = shownTimes();
     pen.strokeStyle = colour.truth; pen.lineWidth = 2; pen.lineCap = "round"; pen.setLineDash([1.5, 4.5]);
     for (const [owner, indices] of truthOf) if (state.agents.has(shownOf.get(owner))) drawTrack(truth, indices, first, last);
     pen.setLineDash([]); pen.lineCap = "butt";
   }
   function drawSensors(colour) {
     if (!poses) return;
-    const { now, first } = span();
+    const { now, first } = shownTimes();
     pen.strokeStyle = pen.fillStyle = colour.sensor; pen.lineWidth = 1.2;
     for (const [owner, indices] of posesOf) {
       pen.globalAlpha = 0.6; drawTrack(poses, indices, first, now); pen.globalAlpha = 1;
@@ -327,7 +336,7 @@
   }
   function drawDetections(colour) {
     if (!detections) return;
-    const { now, first, last } = span();
+    const { now, first, last } = shownTimes(), latest = new Map();
     pen.lineWidth = 1;
     let from = 0, to = detections.time.length;
     while (from < to) { const middle = (from + to) >> 1; if (detections.time[middle] < first) from = middle + 1; else to = middle; }
@@ -335,9 +344,12 @@
       const owner = detections.owner[i];
       if (owner >= 0 && !state.agents.has(shownOf.get(owner))) continue;
       const x = screenX(detections.position[2 * i]), y = screenY(detections.position[2 * i + 1]);
+      // Of detections that would cover each other one is drawn: dense bursts stay dots.
+      const other = latest.get(owner), isLater = detections.time[i] > now + 0.0006;
+      if (other && other.isLater === isLater && Math.hypot(x - other.x, y - other.y) < 5) continue;
+      latest.set(owner, { x, y, isLater });
       pen.beginPath(); pen.arc(x, y, 3.4, 0, 2 * Math.PI);
-      // float32 seconds: a detection at the origin itself is one of the past.
-      if (detections.time[i] > now + 0.002) { pen.strokeStyle = colour.detection; pen.globalAlpha = 0.55; pen.stroke(); }
+      if (isLater) { pen.strokeStyle = colour.detection; pen.globalAlpha = 0.55; pen.stroke(); }
       else {
         pen.strokeStyle = colour.card; pen.globalAlpha = 0.9; pen.stroke();
         pen.fillStyle = colour.detection; pen.globalAlpha = 1 - (0.75 * (now - detections.time[i])) / Math.max(now - first, 1e-9); pen.fill();
@@ -428,6 +440,15 @@
     playButton.textContent = isPlaying ? "Pause" : "Play";
   }
 
+  const spanBox = byId("span");
+  for (const share of new Set([1, 0.5, 0.25, 0.125, data.shown_share])) {
+    const option = document.createElement("option");
+    option.value = String(share);
+    option.textContent = `${period(backSeconds(share))} back, ${period(aheadSeconds(share))} ahead`;
+    option.selected = share === state.span;
+    spanBox.append(option);
+  }
+  spanBox.addEventListener("change", () => { state.span = Number(spanBox.value); draw(); });
   slider.max = String(Math.max(data.window.length - 1, 0));
   slider.addEventListener("input", () => setWindow(Number(slider.value)));
   playButton.addEventListener("click", () => play(!state.timer));

@@ -31,6 +31,7 @@ def build_payload(
     agents: Sequence[int],
     geodesy: GeodesyFit | None,
     max_points: int,
+    shown_share: float,
 ) -> Payload:
     """Everything that the map's script needs for the windows and agents shown."""
     origin_m = _centre(mission)
@@ -49,6 +50,7 @@ def build_payload(
         "window": [int(window) for window in windows],
         "origin_s": [_seconds(mission, mission.origins_ns[window]) for window in windows],
         "cells": [[_cell(rows.get((window, agent))) for agent in agents] for window in windows],
+        "shown_share": shown_share,
         "step_s": first.step_ns / 1e9 if first else 1.0,
         "origin_index": first.origin_index if first else 0,
         "num_steps": int(first.offset_m.shape[1]) if first else 1,
@@ -121,7 +123,7 @@ def _encode_points(mission: Mission, points: Points | None, origin_m: Floats) ->
     if points is None:
         return None
     return {
-        "time_s": _base64((points.time_ns - mission.start_ns) / 1e9, "<f4"),
+        "time_s": _base64((points.time_ns - mission.start_ns) / 1e9, "<f8"),
         "owner": _base64(points.owner, "<i2"),
         "position_m": _base64(points.position_m - origin_m, "<f4"),
     }

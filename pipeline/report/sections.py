@@ -5,13 +5,13 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from pipeline.report.analysis import Analysis, Moment, Trouble, find_troubles, shape_of
+from pipeline.report.analysis import Analysis, Moment, Trouble, find_troubles, shape_of, shown_share, shown_steps
 from pipeline.report.charts import SpreadAxis, TimeAxis, uncertainty_chart
 from pipeline.report.clock import Clock, duration
 from pipeline.report.lengths import metres
 from pipeline.report.maps import moment_map
 from pipeline.report.markup import label, legend, section, table, text
-from pipeline.report.mission import Mission, WindowRow
+from pipeline.report.mission import Fan, Mission, WindowRow
 
 OPEN_ROWS, MAX_ROWS, MAX_RUNS = 10, 300, 4
 OPEN_CHART_ROWS, MAX_CHART_ROWS = 8, 60
@@ -25,6 +25,7 @@ def moments_section(mission: Mission, analysis: Analysis, moments: Sequence[Mome
         return ""
     clock = Clock(mission.start_ns, mission.end_ns)
     ages = {(row.window, row.agent): row.age_s for row in mission.rows}
+    share = shown_share(mission)
     figures = []
     for moment in moments:
         fan = mission.fans[moment.fan]
@@ -33,7 +34,11 @@ def moments_section(mission: Mission, analysis: Analysis, moments: Sequence[Mome
         words += [f"spread {metres(analysis.spread_now_m[moment.fan])}"]
         words += [f"last seen {duration(age)} before"] if age is not None else []
         words += [f"mean {metres(error_m)} from truth"] if np.isfinite(error_m) else []
-        drawing = moment_map(mission, fan, shape_of(fan), f"{moment.reason}. {', '.join(words)}")
+        steps = _moment_steps(mission, fan, share)
+        if share < 1:
+            back, ahead = (duration(abs(step - fan.origin_index) * fan.step_ns / 1e9) for step in steps)
+            words += [f"drawn {back} back and {ahead} ahead"]
+        drawing = moment_map(mission, fan, shape_of(fan), steps, f"{moment.reason}. {', '.join(words)}")
         place = f'data-seconds="{(fan.origin_ns - mission.start_ns) / 1e9:.3f}" data-agent="{fan.agent}"'
         figures.append(
             f"<figure>{drawing}<figcaption><strong>{text(moment.reason)}.</strong> {text(', '.join(words))}. "
@@ -42,6 +47,14 @@ def moments_section(mission: Mission, analysis: Analysis, moments: Sequence[Mome
         )
     lead = "Windows that deserve a look, one agent each. North is up; scales differ."
     return section("Chosen moments", f'<div class="moments">{"".join(figures)}</div>', lead)
+
+
+def _moment_steps(mission: Mission, fan: Fan, share: float) -> tuple[int, int]:
+    """The steps to draw: the share, and as far back as the last detection."""
+    first, last = shown_steps(fan, share)
+    time_ns = mission.detections.of(fan.agent).between(int(fan.time_ns[0]), fan.origin_ns).time_ns
+    seen = int(np.searchsorted(fan.time_ns, time_ns[-1])) if len(time_ns) else first
+    return max(0, min(first, seen - 2)), last
 
 
 def uncertainty_section(mission: Mission, analysis: Analysis) -> str:

@@ -12,14 +12,14 @@ from tqdm import tqdm
 
 from pipeline.manifest import JsonObject, StageResult, run_stage
 from pipeline.progress import Progress
-from pipeline.report.analysis import Analyser, Analysis, Moment, choose_moments, shape_of
+from pipeline.report.analysis import Analyser, Analysis, Moment, choose_moments, shape_of, shown_share
 from pipeline.report.fans import Detail, FanCode, choose_detail, encode_fan
 from pipeline.report.geodesy import fit_geodesy
 from pipeline.report.mission import Floats, Mission, load_mission, mission_inputs
 from pipeline.report.page import write_page
 from pipeline.report.payload import Payload, build_payload
 
-FIXED_BYTES, BYTES_A_POINT, BYTES_A_CELL, BYTES_A_CHART_ROW = 250_000, 14, 32, 12_000
+FIXED_BYTES, BYTES_A_POINT, BYTES_A_CELL, BYTES_A_CHART_ROW = 250_000, 25, 32, 12_000
 """Room for what is not a fan of the interactive map: text and small maps, points, window rows, charts."""
 
 
@@ -37,7 +37,7 @@ class ReportConfig:
     num_moments: int = 6
     max_hypotheses: int = 30
     max_vertices: int = 96
-    max_points: int = 15_000
+    max_points: int = 20_000
 
     def __post_init__(self) -> None:
         if (
@@ -107,7 +107,7 @@ def _payload(mission: Mission, config: ReportConfig, moments: Sequence[Moment], 
             codes.append(encode_fan(fan, shape_of(fan), detail))
         bar.update(1)
     geodesy = fit_geodesy(mission.frame, *_extent(mission, codes))
-    return build_payload(mission, codes, windows, agents, geodesy, config.max_points)
+    return build_payload(mission, codes, windows, agents, geodesy, config.max_points, shown_share(mission))
 
 
 def _budget_bytes(mission: Mission, config: ReportConfig) -> float:
