@@ -57,17 +57,17 @@ class UNet(nn.Module):
         widths = [config.width * m for m in config.multipliers]
         self.stem = nn.Conv1d(config.in_channels, widths[0], config.kernel_size, padding=config.kernel_size // 2)
         self.down = nn.ModuleList()
-        self.halve = nn.ModuleList()
+        self.narrow = nn.ModuleList()
         channels = widths[0]
         for level, width in enumerate(widths):
             self.down.append(_blocks(config, channels, width))
-            self.halve.append(nn.Conv1d(width, width, 3, stride=2, padding=1) if level + 1 < len(widths) else nn.Identity())
+            self.narrow.append(nn.Conv1d(width, width, 3, stride=2, padding=1) if level + 1 < len(widths) else nn.Identity())
             channels = width
         self.middle = _blocks(config, channels, channels)
         self.up = nn.ModuleList()
-        self.double = nn.ModuleList()
+        self.widen = nn.ModuleList()
         for level in range(len(widths) - 2, -1, -1):
-            self.double.append(nn.ConvTranspose1d(channels, widths[level], 4, stride=2, padding=1))
+            self.widen.append(nn.ConvTranspose1d(channels, widths[level], 4, stride=2, padding=1))
             self.up.append(_blocks(config, 2 * widths[level], widths[level]))
             channels = widths[level]
         self.head_norm = nn.GroupNorm(config.num_groups, channels)
@@ -84,16 +84,16 @@ class UNet(nn.Module):
             raise ValueError(f"UNet: {trajectory.shape[-1]} steps are not a multiple of {factor}")
         hidden = self.stem(trajectory)
         skips = []
-        for blocks, halve in zip(self.down, self.halve, strict=True):
+        for blocks, narrow in zip(self.down, self.narrow, strict=True):
             for block in blocks:  # type: ignore[attr-defined]
                 hidden = block(hidden, condition)
             skips.append(hidden)
-            hidden = halve(hidden)
+            hidden = narrow(hidden)
         for block in self.middle:
             hidden = block(hidden, condition)
         skips.pop()
-        for double, blocks in zip(self.double, self.up, strict=True):
-            hidden = torch.cat([double(hidden), skips.pop()], dim=1)
+        for widen, blocks in zip(self.widen, self.up, strict=True):
+            hidden = torch.cat([widen(hidden), skips.pop()], dim=1)
             for block in blocks:  # type: ignore[attr-defined]
                 hidden = block(hidden, condition)
         hidden = self.head_act(self.head_norm(hidden))

@@ -14,8 +14,7 @@ from torch import Tensor
 from cadence.bank.bank import Bank
 from cadence.bank.hindsight import candidates
 from cadence.bank.rows import active_rows
-from cadence.bank.smoother import Nodes
-from cadence.diffusion.residual import ResidualContext, build_context
+from cadence.diffusion.residual import MAX_DETECTIONS, ResidualContext, build_context
 from cadence.types import Detections, WindowBatch
 from cadence.worlds.kinematics import SUBSTEPS, SyntheticTracks, draw_scenario, simulate_tracks
 
@@ -85,8 +84,7 @@ def residual_windows(bank: Bank, windows: WindowBatch, truth_m: Tensor, num_samp
 
 
 def _padded(context: ResidualContext) -> ResidualContext:
-    from cadence.diffusion.residual import MAX_DETECTIONS
-
+    """The context with room for `MAX_DETECTIONS` in every window, so that windows of many scenarios can be joined."""
     missing = MAX_DETECTIONS - context.detections.shape[1]
     if missing <= 0:
         return context

@@ -1,0 +1,103 @@
+"""Checkpoints: weights as safetensors (never pickle), everything else as JSON beside them."""
+
+import dataclasses
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import cadence
+from cadence.errors import ConfigError, DeviceError
+from pipeline.config import config_as_dict, read_config
+from pipeline.manifest import hash_file, write_atomic
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+from torch import Tensor, nn
+
+FORMAT = 1
+DEFAULT = "general"
+"""Name of the shipped checkpoint that is used unless another is asked for."""
+
+
+@dataclass(frozen=True)
+class CheckpointInfo:
+    """The JSON beside the weights.
+
+    preset    "general" or "paper"
+    network   the network's configuration
+    training  command, seed, steps and data that made it
+    scores    what validation measured
+    """
+
+    preset: str
+    network: dict[str, Any]
+    training: dict[str, Any] = field(default_factory=dict)
+    scores: dict[str, Any] = field(default_factory=dict)
+    format: int = FORMAT
+
+
+def find_checkpoint(name: str) -> Path:
+    """The weights file for a path, or for the name of a shipped checkpoint."""
+    shipped = Path(cadence.__file__).parent / "checkpoints"
+    path = Path(name) if name.endswith(".safetensors") else shipped / f"{name}.safetensors"
+    if not path.is_file():
+        known = ", ".join(sorted(p.stem for p in shipped.glob("*.safetensors"))) or "none"
+        raise ConfigError(f"checkpoint {name!r}: not found; give a .safetensors file or a shipped name ({known})")
+    return path
+
+
+def save_checkpoint(path: Path, network: nn.Module, info: CheckpointInfo) -> None:
+    """Write weights and JSON; each atomically, the JSON last."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        partial = path.with_name(f".{path.name}.{os.getpid()}.part")
+        save_file({name: value.contiguous() for name, value in network.state_dict().items()}, partial)
+        os.replace(partial, path)
+    except (OSError, SafetensorError) as error:
+        raise DeviceError(f"{path}: cannot write the checkpoint ({error}); check the folder and the free space") from error
+    write_atomic(path.with_suffix(".json"), json.dumps(config_as_dict(info), indent=1, sort_keys=True) + "\n")
+
+
+def read_info(path: Path) -> CheckpointInfo:
+    """The JSON beside the weights at `path`."""
+    beside = path.with_suffix(".json")
+    try:
+        content = json.loads(beside.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigError(f"{beside}: cannot read the checkpoint's description ({error.strerror}); it belongs beside the weights") from error
+    except ValueError as error:
+        raise ConfigError(f"{beside}: not valid JSON ({error}); take the checkpoint again from where it came") from error
+    if not isinstance(content, Mapping) or content.get("format") != FORMAT:
+        raise ConfigError(f"{beside}: not a checkpoint of format {FORMAT}; train again or take one that fits this version")
+    return read_config(CheckpointInfo, content, str(beside))
+
+
+def load_weights(path: Path, network: nn.Module) -> None:
+    """Put the weights at `path` into `network`; `ConfigError` names the first tensor that does not fit."""
+    try:
+        tensors: dict[str, Tensor] = load_file(path)
+    except (OSError, SafetensorError) as error:
+        raise ConfigError(f"{path}: not readable as safetensors ({error}); take the checkpoint again") from error
+    expected = network.state_dict()
+    for name, value in expected.items():
+        if name not in tensors or tensors[name].shape != value.shape:
+            got = tuple(tensors[name].shape) if name in tensors else "nothing"
+            raise ConfigError(f"{path}: does not fit: {name} should be {tuple(value.shape)}, found {got}; weights and JSON must be of one training")
+    extra = sorted(set(tensors) - set(expected))
+    if extra:
+        raise ConfigError(f"{path}: does not fit: holds {extra[0]}, which this network has not; weights and JSON must be of one training")
+    network.load_state_dict(tensors)
+
+
+def checkpoint_hash(path: Path) -> str:
+    """Hash of weights and JSON together, for manifests."""
+    return hash_file(path)[:16] + hash_file(path.with_suffix(".json"))[:16]
+
+
+def network_config(cls: type[Any], info: CheckpointInfo, where: Path) -> Any:
+    """The network's configuration as an instance of `cls`."""
+    if not dataclasses.is_dataclass(cls):
+        raise TypeError(f"{cls} is not a dataclass")
+    return read_config(cls, info.network, f"{where.with_suffix('.json')}: network")
