@@ -249,11 +249,12 @@ def simulate(
 
 @app.command()
 def train(
-    out: Out, config: Config = None, settings: Set = None, seed: Seed = None, quiet: Quiet = False, as_json: Json = False
-) -> None:
+    out: Out, config: Config = None, settings: Set = None, seed: Seed = None, force: Force = False, quiet: Quiet = False,
+    as_json: Json = False,
+) -> None:  # fmt: skip
     """Train a checkpoint.
 
-    From a folder of logs with truth, or from the simulator. Continues after an interruption.
+    From a folder of logs with truth, or from the simulator. An interrupted training goes on where it was, unless --force.
 
     \b
     Examples:
@@ -263,7 +264,7 @@ def train(
     from pipeline.train import TrainConfig
     from pipeline.train import train as stage
 
-    _show(stage(out, stage_config(TrainConfig, "train", config, settings or (), seed), Progress(quiet)), as_json)
+    _show(stage(out, stage_config(TrainConfig, "train", config, settings or (), seed), Progress(quiet), force), as_json)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

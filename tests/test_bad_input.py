@@ -133,6 +133,25 @@ def test_out_of_order_time_stamps_give_the_same_detections(tmp_path, out, capsys
     assert tables[0].to_pylist() == tables[1].to_pylist()
 
 
+@pytest.mark.parametrize(
+    ("source", "says"),
+    [
+        ('topic = "/nope"', "/nope"),
+        ('topic = "/detections/target"\nx = "pose.position.east"\ny = "pose.position.y"', "east"),
+        ('topic = "/detections/target"\nx = "pose..x"\ny = "pose.position.y"', "pose..x"),
+        ('topic = "/detections/target"\npreset = "Nope"', "Nope"),
+    ],
+    ids=["topic", "field", "path", "preset"],
+)
+def test_mapping_that_does_not_fit_is_refused(source, says, tmp_path, out, capsys):
+    config = tmp_path / "c.toml"
+    config.write_text(f"[[extract.detections]]\n{source}\n")
+    code, err, _ = run(capsys, write_log(tmp_path / "ok.mcap", straight_line()), out, "--config", str(config))
+    assert code in (3, 4)
+    assert_refused((code, err, None), code, says)
+    assert_no_partial_files(out)
+
+
 def test_unknown_configuration_key_is_refused_before_anything_is_written(tmp_path, out, capsys):
     log = write_log(tmp_path / "ok.mcap", straight_line())
     config = tmp_path / "c.toml"

@@ -39,8 +39,7 @@ def test_help_of_each_command_is_complete(command, capsys):
 def test_common_options_are_everywhere(command, capsys):
     cli.main([command, "--help"])
     text = capsys.readouterr().out
-    assert all(f"{option} " in text for option in ("--config", "--set", "--quiet", "--json"))
-    assert ("--force " in text) == (command != "train")  # train continues what is there
+    assert all(f"{option} " in text for option in ("--config", "--set", "--force", "--quiet", "--json"))
 
 
 def test_version(capsys):

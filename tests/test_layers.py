@@ -41,6 +41,10 @@ GLOBAL_RANDOM = {"seed", "rand", "randn", "normal", "uniform", "choice", "shuffl
 MAX_FILE_LINES = 400
 MAX_FUNCTION_LINES = 60
 LONG_FILES: dict[str, str] = {}  # path: the reason why it is one file
+GLOBAL_SEEDS = {  # path: the reason why it may seed the global generator
+    "pipeline/train.py": "torch draws initial weights from no other",
+    "pipeline/train_absolute.py": "torch draws initial weights from no other",
+}
 LONG_FUNCTIONS: dict[str, str] = {}  # path::function: the reason why it is one function
 
 
@@ -105,7 +109,7 @@ def test_no_global_random_state(path):
             owner = ast.unparse(node.func.value)
             where = f"line {node.lineno}: {owner}.{node.func.attr}"
             assert not (owner in ("np.random", "numpy.random", "random") and node.func.attr in GLOBAL_RANDOM), where
-            assert (owner, node.func.attr) != ("torch", "manual_seed"), where
+            assert (owner, node.func.attr) != ("torch", "manual_seed") or name_of(path) in GLOBAL_SEEDS, where
             if owner == "torch" and node.func.attr in ("randn", "rand", "randint", "randperm", "normal"):
                 assert any(keyword.arg == "generator" for keyword in node.keywords), f"{where} without a generator"
 
