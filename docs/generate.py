@@ -21,6 +21,7 @@ import typer.testing
 
 import cli
 from pipeline.config import TABLES
+from pipeline.presets import PRESETS
 
 COMMANDS = ("info", "run", "ingest", "extract", "infer", "export", "report", "evaluate", "simulate", "train")
 
@@ -52,6 +53,10 @@ num_hypotheses = 50
 """
 
 
+PRESETS_INTRODUCTION = """Message types whose fields are known. A source without paths takes the preset of its channel's schema.
+"""
+
+
 def cli_page() -> str:
     """docs/cli.md: the help of the program and of every command."""
     parts = [CLI_INTRODUCTION, "## cadence\n", _help([])]
@@ -67,7 +72,10 @@ def configuration_page() -> str:
         cls = stage_config_class(table)
         parts.append(f"## [{table}]\n")
         parts += _tables_of(cls, table)
-    return "\n".join(parts)
+    parts += ["## Presets\n", PRESETS_INTRODUCTION, "| preset | schemas (in any spelling) |", "|---|---|"]
+    for name, preset in sorted(PRESETS.items()):
+        parts.append(f"| `{name}` | {', '.join(f'`{schema}`' for schema in preset.schemas)} |")
+    return "\n".join(parts) + "\n"
 
 
 def stage_config_class(table: str) -> type[Any]:

@@ -14,7 +14,13 @@ _LEVEL_SCALE = 100.0
 
 @dataclass(frozen=True)
 class ResidualNetworkConfig:
-    """Sizes of the general preset's network."""
+    """Sizes of the general preset's network.
+
+    width, multipliers  channels of the first level, and their multiples on every level (each halves the time resolution)
+    num_blocks          residual blocks of a level
+    encoder_size        of the vector that stands for the detections
+    level_size          of the vector that stands for the noise level
+    """
 
     width: int = 32
     multipliers: tuple[int, ...] = (1, 2, 4)

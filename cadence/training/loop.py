@@ -18,6 +18,13 @@ class OptimiserConfig:
     """Adam with a linear warm-up and a cosine decay to a fiftieth.
 
     The paper: learning rate 2e-4, EMA 0.995 every 10 steps.
+
+    learning_rate      after the warm-up
+    num_steps          length of the training
+    warm_up_steps      in which the rate grows from zero
+    ema_decay          of the average of the weights, which is what is kept
+    max_gradient_norm  longer gradients are shortened to it
+    bf16               compute in bfloat16, where the processor is faster with it
     """
 
     learning_rate: float = 1e-3
