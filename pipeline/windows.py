@@ -4,6 +4,7 @@ Inside a window time is seconds relative to its origin and space metres relative
 float64 mission coordinates end here.
 """
 
+import itertools
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -61,14 +62,17 @@ class Grid:
 
     @property
     def step_s(self) -> float:
+        """Seconds between two steps."""
         return self.step_ns * 1e-9
 
     @property
     def num_steps(self) -> int:
+        """Number of steps T of a window."""
         return self.history_steps + self.horizon_steps
 
     @property
     def origin_index(self) -> int:
+        """Index of the step at the origin, the last of the history."""
         return self.history_steps - 1
 
     @property
@@ -204,7 +208,7 @@ def fit_tracks(detections: pa.Table, grid: Grid, default_sigma_m: float = 0.0) -
         cell = (kept.time_ns - kept.time_ns[0]) // length_ns
         cuts = np.flatnonzero(np.diff(cell)) + 1
         bounds = [0, *cuts.tolist(), len(cell)]
-        for begin, end in zip(bounds[:-1], bounds[1:], strict=True):
+        for begin, end in itertools.pairwise(bounds):
             pieces.append(_AgentTrack(kept.time_ns[begin:end], kept.position_m[begin:end], kept.covariance_m2[begin:end]))
     n = max(len(piece.time_ns) for piece in pieces)
     r = len(pieces)

@@ -18,6 +18,7 @@ from cadence.bank.mixture import (
     MAX_MODELS,
     MIN_WEIGHT,
     Chosen,
+    Numbers,
     at_node,
     choose_models,
     merge_grid,
@@ -25,7 +26,7 @@ from cadence.bank.mixture import (
     random_numbers,
 )
 from cadence.bank.rows import active_rows, scatter_hypotheses, track_rows
-from cadence.bank.smoother import Nodes, backward_kernel, draw, filter_forward, smooth
+from cadence.bank.smoother import Filtered, Nodes, backward_kernel, draw, filter_forward, smooth
 from cadence.bank.switching import SwitchingModels, continue_moments, continue_samples, durations_after
 from cadence.types import Detections, HypothesisSet, WindowBatch
 
@@ -137,46 +138,89 @@ class Bank:
     def _posterior_rows(
         self, rows: Nodes, log_posterior: Tensor, seeds: Tensor, windows: WindowBatch, num_hypotheses: int
     ) -> tuple[Tensor, Tensor, Tensor]:
-        chosen = choose_models(log_posterior)
-        nodes, step_index = merge_grid(rows, windows.time_s)
+        """Mean [R, T, 2], sigma [R, T] and samples [R, K, T, 2] of some rows whose detections have their floor already."""
         models = self.models.scaled(windows.step_s, self._speed())
-        diffuse = torch.full((len(chosen.row),), DIFFUSE_STEPS * self._speed() * windows.step_s, dtype=torch.float64)
-        filtered = filter_forward(models[chosen.model], nodes[chosen.row], diffuse)
-        backward = backward_kernel(filtered)
-        node_mean, node_covariance = smooth(filtered, backward)
-        pick = step_index[chosen.row]
-        mean = node_mean[..., :2].gather(1, pick[..., None].expand(-1, -1, 2))
-        variance = (0.5 * (node_covariance[..., 0, 0] + node_covariance[..., 1, 1])).gather(1, pick)
-        mean, variance = mixture_moments(mean, variance, chosen)
-        numbers = random_numbers(chosen.weight, rows, seeds, num_hypotheses, nodes.time_s.shape[1], windows.num_steps)
-        pair = chosen.first_pair[:, None] + numbers.owner
-        state = draw(backward, pair.flatten(), numbers.normal.flatten(0, 1)).view(len(mean), num_hypotheses, -1, 4)
-        sample = state[..., :2].gather(2, step_index[:, None, :, None].expand(-1, num_hypotheses, -1, 2))
-        if self.switch_rate == 0.0:
-            return mean, variance.sqrt(), sample
+        diffuse_m = DIFFUSE_STEPS * self.length_m(windows.step_s)
+        smoothed = _smooth_rows(models, rows, choose_models(log_posterior), seeds, windows.time_s, num_hypotheses, diffuse_m)
+        if self.switch_rate > 0.0:
+            last_s = torch.where(rows.is_observed, rows.time_s, rows.time_s[:, :1]).amax(1)
+            self._switch_after(smoothed, models, durations_after(windows.time_s.double(), last_s), windows.step_s)
+        return smoothed.mean_m, smoothed.variance_m2.sqrt(), smoothed.sample_m
+
+    def _switch_after(self, smoothed: "_Smoothed", models: MotionModels, durations: Tensor, step_s: float) -> None:
+        """Replace what `smoothed` says of the time after the last detection (durations [R, T]) by models that change."""
         # only models that carry weight take part after the last detection
-        taking_part, chosen_index, later = self._models_after(chosen)
-        switching = SwitchingModels(models[taking_part], later, self.switch_rate / windows.step_s)
-        last_s = torch.where(rows.is_observed, rows.time_s, rows.time_s[:, :1]).amax(1)
-        durations = durations_after(windows.time_s.double(), last_s)
-        begin = int((durations > 0).any(0).to(torch.int64).argmax()) if (durations > 0).any() else windows.num_steps
-        is_after = (durations > 0)[:, begin:]
-        node = (nodes.is_observed * torch.arange(1, nodes.time_s.shape[1] + 1)).argmax(1)
-        last_mean, last_covariance, weight = at_node(filtered, chosen, chosen_index, node, len(taking_part))
-        later_mean, later_variance = continue_moments(switching, durations[:, begin:], weight, last_mean, last_covariance)
-        last_state = state[torch.arange(len(node))[:, None], torch.arange(num_hypotheses), node[:, None]]
-        later = continue_samples(
+        taking_part, chosen_index, later = self._models_after(smoothed.chosen)
+        switching = SwitchingModels(models[taking_part], later, self.switch_rate / step_s)
+        begin = int((durations > 0).any(0).to(torch.int64).argmax()) if (durations > 0).any() else durations.shape[1]
+        durations = durations[:, begin:]
+        is_after = durations > 0
+        node = smoothed.last_node
+        mean, covariance, weight = at_node(smoothed.filtered, smoothed.chosen, chosen_index, node, len(taking_part))
+        later_mean, later_variance = continue_moments(switching, durations, weight, mean, covariance)
+        num_hypotheses, numbers = smoothed.sample_m.shape[1], smoothed.numbers
+        state = smoothed.state[torch.arange(len(node))[:, None], torch.arange(num_hypotheses), node[:, None]]
+        later_sample = continue_samples(
             switching,
-            durations[:, begin:],
-            chosen_index[pair],
-            last_state,
+            durations,
+            chosen_index[smoothed.pair],
+            state,
             numbers.uniform[:, :, begin:],
             numbers.kick[:, :, begin:],
         )
-        mean[:, begin:] = torch.where(is_after[..., None], later_mean, mean[:, begin:])
-        variance[:, begin:] = torch.where(is_after, later_variance, variance[:, begin:])
-        sample[:, :, begin:] = torch.where(is_after[:, None, :, None], later, sample[:, :, begin:])
-        return mean, variance.sqrt(), sample
+        for whole, part, where in (
+            (smoothed.mean_m[:, begin:], later_mean, is_after[..., None]),
+            (smoothed.variance_m2[:, begin:], later_variance, is_after),
+            (smoothed.sample_m[:, :, begin:], later_sample, is_after[:, None, :, None]),
+        ):
+            whole.copy_(torch.where(where, part, whole))
+
+
+@dataclass(frozen=True, eq=False)
+class _Smoothed:
+    """Rows between their detections: the mixture on the grid, and what is needed to go on after the last detection.
+
+    mean_m [R, T, 2], variance_m2 [R, T], sample_m [R, K, T, 2]; state [R, K, M, 4] of the samples at the nodes, pair [R, K]
+    which pair of row and model drew them, last_node [R] of the last detection.
+    """
+
+    chosen: Chosen
+    filtered: Filtered
+    numbers: Numbers
+    mean_m: Tensor
+    variance_m2: Tensor
+    sample_m: Tensor
+    state: Tensor
+    pair: Tensor
+    last_node: Tensor
+
+
+def _smooth_rows(
+    models: MotionModels,
+    rows: Nodes,
+    chosen: Chosen,
+    seeds: Tensor,
+    time_s: Tensor,
+    num_hypotheses: int,
+    diffuse_m: float,
+) -> _Smoothed:
+    """Filter, smooth and sample every pair of row and chosen model, and mix the models of each row."""
+    nodes, step_index = merge_grid(rows, time_s)
+    diffuse = torch.full((len(chosen.row),), diffuse_m, dtype=torch.float64)
+    filtered = filter_forward(models[chosen.model], nodes[chosen.row], diffuse)
+    backward = backward_kernel(filtered)
+    node_mean, node_covariance = smooth(filtered, backward)
+    pick = step_index[chosen.row]
+    mean = node_mean[..., :2].gather(1, pick[..., None].expand(-1, -1, 2))
+    variance = (0.5 * (node_covariance[..., 0, 0] + node_covariance[..., 1, 1])).gather(1, pick)
+    mean, variance = mixture_moments(mean, variance, chosen)
+    num_nodes = nodes.time_s.shape[1]
+    numbers = random_numbers(chosen.weight, rows, seeds, num_hypotheses, num_nodes, len(time_s))
+    pair = chosen.first_pair[:, None] + numbers.owner
+    state = draw(backward, pair.flatten(), numbers.normal.flatten(0, 1)).view(len(mean), num_hypotheses, -1, 4)
+    sample = state[..., :2].gather(2, step_index[:, None, :, None].expand(-1, num_hypotheses, -1, 2))
+    last_node = (nodes.is_observed * torch.arange(1, num_nodes + 1)).argmax(1)
+    return _Smoothed(chosen, filtered, numbers, mean, variance, sample, state, pair, last_node)
 
 
 def em_weights(log_likelihood: Tensor, pseudo_count: float) -> tuple[Tensor, Tensor]:

@@ -12,6 +12,7 @@ Everything is closed form, so that detections may lie at any times.
 import itertools
 import math
 from dataclasses import dataclass
+from types import EllipsisType
 
 import torch
 from torch import Tensor
@@ -134,7 +135,7 @@ _WEIGHTS = torch.tensor([0.1739274225687269, 0.3260725774312731, 0.3260725774312
 
 
 def _noise(
-    models: MotionModels, rate: Tensor, duration: Tensor, z: Tensor, extra: tuple[object, ...]
+    models: MotionModels, rate: Tensor, duration: Tensor, z: Tensor, extra: tuple[EllipsisType | None, ...]
 ) -> tuple[Tensor, Tensor, Tensor]:
     """The integrals of the noise response (s phi1(a s), exp(a s)) over the duration, times the diffusion."""
     diffusion = models.diffusion[extra].expand(duration.shape)

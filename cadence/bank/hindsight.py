@@ -52,4 +52,5 @@ def _score(bank: Bank, windows: WindowBatch, later: Detections, is_used: Tensor)
     spread = (foreseen[:, :half] - foreseen[:, half:]).norm(dim=-1).mean(1)
     last = torch.where(windows.detections.is_observed, windows.detections.time_s, -torch.inf).amax(-1, keepdim=True)
     scale = (later.time_s - last).clamp_min(windows.step_s)
-    return ((error - 0.5 * spread) / scale)[is_used].mean()
+    score: Tensor = ((error - 0.5 * spread) / scale)[is_used].mean()
+    return score

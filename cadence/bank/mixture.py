@@ -26,8 +26,11 @@ class Chosen:
 
 @dataclass(frozen=True, eq=False)
 class Numbers:
-    """Random numbers of each row's own seed: owner [R, K] (which chosen model draws), normal [R, K, M, 4] for the nodes,
-    uniform [R, K, T, 2] and kick [R, K, T, 4] for the continuation.
+    """Random numbers of each row's own seed.
+
+    owner   [R, K] which of the row's chosen models draws the hypothesis
+    normal  [R, K, M, 4] for the nodes
+    uniform [R, K, T, 2] and kick [R, K, T, 4] for the continuation after the last detection
     """
 
     owner: Tensor
@@ -37,6 +40,7 @@ class Numbers:
 
 
 def choose_models(log_posterior: Tensor) -> Chosen:
+    """The likeliest models of each row [R, C], at most `MAX_MODELS`, weights normalised; never none."""
     weight, model = torch.softmax(log_posterior, dim=1).topk(min(MAX_MODELS, log_posterior.shape[1]), dim=1)
     weight = torch.where(weight >= MIN_WEIGHT * weight[:, :1], weight, torch.zeros_like(weight))
     weight = weight / weight.sum(1, keepdim=True)
@@ -82,6 +86,7 @@ def merge_grid(rows: Nodes, time_s: Tensor) -> tuple[Nodes, Tensor]:
 
 
 def mixture_moments(mean: Tensor, variance: Tensor, chosen: Chosen) -> tuple[Tensor, Tensor]:
+    """Mean [R, T, 2] and variance an axis [R, T] of mixtures whose Q components have `mean` [Q, T, 2], `variance` [Q, T]."""
     num_rows = len(chosen.weight)
     total = torch.zeros(num_rows, *mean.shape[1:], dtype=torch.float64)
     total.index_add_(0, chosen.row, chosen.pair_weight[:, None, None] * mean)

@@ -50,7 +50,8 @@ class Filtered:
 class Backward:
     """The backward kernel x[m] = gain x[m + 1] + offset + root n, which smooths (n = 0 in the mean) and samples.
 
-    gain [P, M - 1, 4, 4], offset [P, M - 1, 4], root [P, M - 1, 4, 4] lower triangular; the last node's law in `mean`, `last_root`.
+    gain [P, M - 1, 4, 4], offset [P, M - 1, 4], root [P, M - 1, 4, 4] lower triangular; the last node's law is in
+    `mean` [P, 4] and `last_root` [P, 4, 4].
     """
 
     gain: Tensor

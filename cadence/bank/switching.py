@@ -39,7 +39,8 @@ def continue_moments(
         switching: C models.
         durations_s: [R, S] time to pass at each step.
         weight: [R, C] probability of each model at the last detection.
-        mean, covariance: [R, C, 4], [R, C, 4, 4] of the state there, given the model (anything where the weight is zero).
+        mean: [R, C, 4] of the state there, given the model (anything finite where the weight is zero).
+        covariance: [R, C, 4, 4] likewise.
 
     Returns:
         Mean [R, S, 2] and variance an axis [R, S].

@@ -55,7 +55,9 @@ class ResidualContext:
 
     def rotated(self, angle: Tensor) -> "ResidualContext":
         """Every window turned by its own angle [R] (augmentation: no direction is special)."""
-        detections = torch.cat([self.detections[..., :1], rotate(self.detections[..., 1:3], angle), self.detections[..., 3:]], -1)
+        detections = torch.cat(
+            [self.detections[..., :1], rotate(self.detections[..., 1:3], angle), self.detections[..., 3:]], -1
+        )
         return ResidualContext(
             rotate(self.mean, angle), self.sigma, self.since, self.until, self.is_future, detections, self.is_observed
         )
@@ -75,7 +77,8 @@ def build_context(posterior: BankPosterior, rows: Nodes, time_s: Tensor, step_s:
         posterior: of the R rows.
         rows: their detections [R, N], oldest first, relative to the origin.
         time_s: [T] grid.
-        step_s, length_m: the units: a step, and the way at typical speed in it.
+        step_s: the unit of time, a step.
+        length_m: the unit of length, the way at typical speed in a step.
     """
     num_rows = len(rows.time_s)
     last = rows.is_observed.sum(1).clamp_min(1) - 1

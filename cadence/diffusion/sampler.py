@@ -5,6 +5,8 @@ does not know what a trajectory is: any shape, conditions and batching live in t
 (guidance, inpainting) or the state after a step (the paper's overwriting).
 """
 
+import itertools
+import math
 from collections.abc import Callable
 
 import torch
@@ -16,6 +18,8 @@ Denoiser = Callable[[Tensor, float], Tensor]
 """(noisy [...], angle) -> clean estimate [...]."""
 Hook = Callable[[Tensor, float], Tensor]
 """(estimate or state [...], angle it is at) -> the same, moved."""
+Draw = Callable[[Tensor], Tensor]
+"""state [...] -> standard normal noise of its shape: for windows that have a random stream each."""
 
 
 def _keep(state: Tensor, angle: float) -> Tensor:
@@ -26,7 +30,7 @@ def sample_ddpm(
     denoise: Denoiser,
     noise: Tensor,
     schedule: Schedule,
-    generator: torch.Generator,
+    generator: torch.Generator | Draw,
     on_mean: Hook = _keep,
     on_state: Hook = _keep,
 ) -> Tensor:
@@ -36,7 +40,7 @@ def sample_ddpm(
         denoise: the denoiser; clamping its estimate is its own business.
         noise: [...] start, standard normal.
         schedule: S steps; all are taken.
-        generator: of the noise added at each step.
+        generator: of the noise added at each step, or a function that draws it.
         on_mean: moves the posterior mean before noise is added (the paper's algorithm 1).
         on_state: changes the state after each step (the paper's inpainting).
     """
@@ -52,9 +56,15 @@ def sample_ddpm(
         mean = before**0.5 * beta * scale * clean + alpha**0.5 * (1.0 - before) * scale * state
         mean = on_mean(mean, angles[s])
         sigma = (beta * (1.0 - before) * scale) ** 0.5
-        fresh = torch.randn(state.shape, generator=generator, dtype=state.dtype, device=state.device) if s else 0.0
+        fresh = _fresh(state, generator) if s else 0.0
         state = on_state(mean + sigma * fresh, angles[s - 1] if s else 0.0)
     return state
+
+
+def _fresh(state: Tensor, generator: torch.Generator | Draw) -> Tensor:
+    if isinstance(generator, torch.Generator):
+        return torch.randn(state.shape, generator=generator, dtype=state.dtype, device=state.device)
+    return generator(state)
 
 
 def sample_ddim(denoise: Denoiser, noise: Tensor, angles: Tensor, on_clean: Hook = _keep, on_state: Hook = _keep) -> Tensor:
@@ -69,7 +79,7 @@ def sample_ddim(denoise: Denoiser, noise: Tensor, angles: Tensor, on_clean: Hook
     """
     state = noise
     levels = angles.tolist()
-    for here, there in zip(levels[:-1], levels[1:], strict=True):
+    for here, there in itertools.pairwise(levels):
         clean = on_clean(denoise(state, here), here)
         state = _rotate(clean, noise_from(clean, state, torch.tensor(here)), there)
         state = on_state(state, there)
@@ -97,15 +107,10 @@ def sample_dpmpp_2m(denoise: Denoiser, noise: Tensor, angles: Tensor, on_clean: 
             state = estimate
         else:
             sin_ratio = torch.sin(levels[s + 1]) / torch.sin(levels[s])
-            state = float(sin_ratio) * state - float(torch.cos(levels[s + 1])) * (math_expm1(-step)) * estimate
+            state = float(sin_ratio) * state - float(torch.cos(levels[s + 1])) * math.expm1(-step) * estimate
         state = on_state(state, there)
         previous = clean
     return state
-
-
-def math_expm1(value: float) -> float:
-    """exp(value) - 1, exact near zero."""
-    return float(torch.expm1(torch.tensor(value, dtype=torch.float64)))
 
 
 def sample_rotation(denoise: Denoiser, noise: Tensor, angles: Tensor, on_clean: Hook = _keep, on_state: Hook = _keep) -> Tensor:
@@ -119,7 +124,7 @@ def sample_rotation(denoise: Denoiser, noise: Tensor, angles: Tensor, on_clean: 
     levels = angles.tolist()
     previous: Tensor | None = None
     step_before = 0.0
-    for here, there in zip(levels[:-1], levels[1:], strict=True):
+    for here, there in itertools.pairwise(levels):
         clean = on_clean(denoise(state, here), here)
         velocity = (torch.cos(torch.tensor(here)) * state - clean) / max(float(torch.sin(torch.tensor(here))), 1e-4)
         step = there - here

@@ -89,7 +89,9 @@ def _padded(context: ResidualContext) -> ResidualContext:
     if missing <= 0:
         return context
     detections = torch.nn.functional.pad(context.detections, (0, 0, 0, missing))
-    return dataclasses.replace(context, detections=detections, is_observed=torch.nn.functional.pad(context.is_observed, (0, missing)))
+    return dataclasses.replace(
+        context, detections=detections, is_observed=torch.nn.functional.pad(context.is_observed, (0, missing))
+    )
 
 
 def _scenario_windows(config: SyntheticConfig, rng: np.random.Generator) -> ResidualWindows | None:
