@@ -80,7 +80,7 @@ class Bank:
             step_s: step of the windows to come; by default a sixteenth of the mean stretch.
         """
         rows = track_rows(tracks)
-        step_s = step_s or _default_step(rows)
+        step_s = step_s or default_step(rows)
         speed_mps = typical_speed(rows, step_s)
         rows = rows[rows.is_observed.sum(-1) > 1]
         if len(rows.time_s) == 0:
@@ -265,6 +265,9 @@ def typical_speed(rows: Nodes, step_s: float) -> float:
     return max(math.sqrt(mean_square), floor_mps)
 
 
-def _default_step(rows: Nodes) -> float:
+def default_step(rows: Nodes) -> float:
+    """Step for windows nobody has planned yet: a sixteenth of the mean stretch, in seconds."""
+    if len(rows.time_s) == 0:
+        return 1.0
     length = rows.time_s.amax(1) - rows.time_s[:, 0]
     return max(float(length.mean()) / 16.0, 1e-3)
