@@ -15,6 +15,9 @@ from pipeline.report.mission import Floats, Ints, Mission, WindowRow
 CHART_WIDTH, LABEL_WIDTH, MARGIN_RIGHT = 1200, 150, 14
 ROW_HEIGHT, TICK_HEIGHT, ROW_GAP = 84, 9, 15
 
+MAX_TICKS = 2 * (CHART_WIDTH - LABEL_WIDTH)
+"""Ticks of a row: those less than half a pixel apart are one."""
+
 
 class TimeAxis:
     """From mission time to the pixels of the charts."""

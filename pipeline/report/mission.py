@@ -104,7 +104,11 @@ class Obstacle:
 
 @dataclass(frozen=True, eq=False)
 class Mission:
-    """Everything that the page tells of one mission."""
+    """Everything that the page tells of one mission.
+
+    start_ns, end_ns          of what is drawn: detections, truth, window origins
+    log_start_ns, log_end_ns  of the log, where it keeps the same clock
+    """
 
     name: str
     catalogue: JsonDict
@@ -122,6 +126,8 @@ class Mission:
     has_stale_scores: bool
     start_ns: int
     end_ns: int
+    log_start_ns: int
+    log_end_ns: int
 
     @property
     def origins_ns(self) -> dict[int, int]:
@@ -152,6 +158,7 @@ def load_mission(directory: Path) -> Mission:
     detection_points = _points(detections, "agent_id", agents)
     truth_points = _points(truth, "agent_id", agents) if truth is not None else None
     start_ns, end_ns = _time_range(catalogue, [points for points in (detection_points, truth_points) if points], rows)
+    log_start_ns, log_end_ns = _log_range(catalogue, start_ns, end_ns)
     return Mission(
         name=_log_name(catalogue, directory),
         catalogue=catalogue,
@@ -169,6 +176,8 @@ def load_mission(directory: Path) -> Mission:
         has_stale_scores=_is_stale(manifests.get("evaluate"), directory / "hypotheses.parquet"),
         start_ns=start_ns,
         end_ns=end_ns,
+        log_start_ns=log_start_ns,
+        log_end_ns=log_end_ns,
     )
 
 
@@ -286,7 +295,15 @@ def _log_name(catalogue: JsonDict, directory: Path) -> str:
 
 
 def _time_range(catalogue: JsonDict, points: list[Points], rows: tuple[WindowRow, ...]) -> tuple[int, int]:
-    """Start and end of what is drawn; the log's own range only where it agrees, since its clocks may be others."""
     times = [int(time) for found in points if len(found) for time in (found.time_ns[0], found.time_ns[-1])]
     times += [rows[0].origin_ns, rows[-1].origin_ns] if rows else []
-    return (min(times), max(times)) if times else (int(catalogue.get("start_ns") or 0), int(catalogue.get("end_ns") or 0))
+    return (min(times), max(times)) if times else _log_range(catalogue, 0, 0)
+
+
+def _log_range(catalogue: JsonDict, start_ns: int, end_ns: int) -> tuple[int, int]:
+    """The log's own range; start and end where it has none, or other clocks than the stamps of the detections."""
+    first, last = catalogue.get("start_ns"), catalogue.get("end_ns")
+    if not isinstance(first, int) or not isinstance(last, int):
+        return start_ns, end_ns
+    is_same_clock = first <= end_ns and start_ns <= last
+    return (first, last) if is_same_clock or start_ns == end_ns else (start_ns, end_ns)

@@ -75,8 +75,8 @@ def _asset(name: str) -> str:
 
 
 def _header(mission: Mission) -> str:
-    clock = Clock(mission.start_ns, mission.end_ns)
-    length = duration((mission.end_ns - mission.start_ns) / 1e9)
+    clock = Clock(mission.log_start_ns, mission.log_end_ns)
+    length = duration((mission.log_end_ns - mission.log_start_ns) / 1e9)
     words = ["Hypothesis tracks from sparse detections", clock.range(), length]
     words += [f"datum {_latitude_longitude(mission.frame)}"] if mission.frame.is_georeferenced else []
     cells = "".join(
@@ -101,7 +101,11 @@ def _facts(mission: Mission) -> list[tuple[str, str, str]]:
     counts = [len(fan.weight) for fan in mission.fans]
     return [
         *facts,
-        ("Steps with a detection", "–" if share is None else f"{100 * share:.3g} %", f"steps of {duration(step_s)}"),
+        (
+            "Steps with a detection",
+            "–" if share is None else f"{100 * share:.3g} %",
+            f"of {duration(step_s)}, while an agent was tracked",
+        ),
         ("Windows", f"{len(mission.origins_ns):,}", f"{duration(fan.origin_index * step_s)} back, {duration(ahead_s)} ahead"),
         ("Hypotheses a window", f"{max(counts):,}", f"{sum(counts):,} tracks in all"),
     ]

@@ -113,7 +113,7 @@ def _trouble_table(mission: Mission, runs: Mapping[int, Sequence[Trouble]]) -> s
     heads, rows = ["agent", "count", "windows", "origins"], []
     for agent, found in sorted(runs.items()):
         words = [" to ".join(clock.moment(row.origin_ns) for row in _ends(trouble)) for trouble in found]
-        spans = ", ".join(words[:MAX_RUNS]) + (f" and {len(words) - MAX_RUNS} more spans" if len(words) > MAX_RUNS else "")
+        spans = ", ".join(words[:MAX_RUNS]) + (f" and {len(words) - MAX_RUNS} more" if len(words) > MAX_RUNS else "")
         numbers = ", ".join(" to ".join(str(row.window) for row in _ends(trouble)) for trouble in found[:MAX_RUNS])
         numbers += ", …" if len(found) > MAX_RUNS else ""
         rows.append([text(mission.agents[agent]), str(sum(trouble.count for trouble in found)), text(numbers), text(spans)])

@@ -13,14 +13,15 @@ from tqdm import tqdm
 from pipeline.manifest import JsonObject, StageResult, run_stage
 from pipeline.progress import Progress
 from pipeline.report.analysis import Analyser, Analysis, Moment, choose_moments, shape_of, shown_share
+from pipeline.report.charts import MAX_TICKS
 from pipeline.report.fans import Detail, FanCode, choose_detail, encode_fan
 from pipeline.report.geodesy import fit_geodesy
 from pipeline.report.mission import Floats, Mission, load_mission, mission_inputs
 from pipeline.report.page import write_page
 from pipeline.report.payload import Payload, build_payload
 
-FIXED_BYTES, BYTES_A_POINT, BYTES_A_CELL, BYTES_A_CHART_ROW = 250_000, 25, 32, 12_000
-"""Room for what is not a fan of the interactive map: text and small maps, points, window rows, charts."""
+FIXED_BYTES, BYTES_A_POINT, BYTES_A_CELL, BYTES_A_TICK = 300_000, 25, 60, 14
+"""Room for what is not a fan of the interactive map: text and small maps, points, window rows, ticks in the charts."""
 
 
 @dataclass(frozen=True)
@@ -113,9 +114,8 @@ def _payload(mission: Mission, config: ReportConfig, moments: Sequence[Moment], 
 def _budget_bytes(mission: Mission, config: ReportConfig) -> float:
     points = [found for found in (mission.detections, mission.truth, mission.poses) if found is not None]
     num_points = sum(min(len(found), config.max_points) for found in points)
-    others = (
-        FIXED_BYTES + num_points * BYTES_A_POINT + len(mission.rows) * BYTES_A_CELL + len(mission.agents) * BYTES_A_CHART_ROW
-    )
+    num_ticks = min(len(mission.detections), MAX_TICKS * len(mission.agents))
+    others = FIXED_BYTES + num_points * BYTES_A_POINT + len(mission.rows) * BYTES_A_CELL + num_ticks * BYTES_A_TICK
     return max(config.max_megabytes * 1e6 - others, config.max_megabytes * 2e5)
 
 
