@@ -8,13 +8,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+from torch import Tensor, nn
+
 import cadence
 from cadence.errors import ConfigError, DeviceError
 from pipeline.config import config_as_dict, read_config
 from pipeline.manifest import hash_file, write_atomic
-from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
-from torch import Tensor, nn
 
 FORMAT = 1
 DEFAULT = "general"
@@ -66,7 +67,9 @@ def read_info(path: Path) -> CheckpointInfo:
     try:
         content = json.loads(beside.read_text(encoding="utf-8"))
     except OSError as error:
-        raise ConfigError(f"{beside}: cannot read the checkpoint's description ({error.strerror}); it belongs beside the weights") from error
+        raise ConfigError(
+            f"{beside}: cannot read the checkpoint's description ({error.strerror}); it belongs beside them"
+        ) from error
     except ValueError as error:
         raise ConfigError(f"{beside}: not valid JSON ({error}); take the checkpoint again from where it came") from error
     if not isinstance(content, Mapping) or content.get("format") != FORMAT:
@@ -84,10 +87,12 @@ def load_weights(path: Path, network: nn.Module) -> None:
     for name, value in expected.items():
         if name not in tensors or tensors[name].shape != value.shape:
             got = tuple(tensors[name].shape) if name in tensors else "nothing"
-            raise ConfigError(f"{path}: does not fit: {name} should be {tuple(value.shape)}, found {got}; weights and JSON must be of one training")
+            raise ConfigError(
+                f"{path}: does not fit: {name} is {got}, should be {tuple(value.shape)}; take both files of one training"
+            )
     extra = sorted(set(tensors) - set(expected))
     if extra:
-        raise ConfigError(f"{path}: does not fit: holds {extra[0]}, which this network has not; weights and JSON must be of one training")
+        raise ConfigError(f"{path}: does not fit: holds {extra[0]}, which the network has not; take both files of one training")
     network.load_state_dict(tensors)
 
 

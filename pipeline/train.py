@@ -1,10 +1,11 @@
 """The train stage: from synthetic kinematics or logs with truth to a checkpoint; killed and started again it goes on."""
 
 import csv
+import functools
 import io
 import os
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
@@ -51,9 +52,9 @@ class TrainConfig:
     validate_every: int = 500
     save_every: int = 250
     threads: int | None = None
-    network: ResidualNetworkConfig = ResidualNetworkConfig()
-    windows: SyntheticConfig = SyntheticConfig()
-    optimiser: OptimiserConfig = OptimiserConfig()
+    network: ResidualNetworkConfig = field(default_factory=ResidualNetworkConfig)
+    windows: SyntheticConfig = field(default_factory=SyntheticConfig)
+    optimiser: OptimiserConfig = field(default_factory=OptimiserConfig)
 
 
 def train(out: Path, config: TrainConfig, progress: Progress, force: bool = False) -> StageResult:
@@ -80,7 +81,7 @@ def train(out: Path, config: TrainConfig, progress: Progress, force: bool = Fals
         while trainer.step < config.optimiser.num_steps:
             generator = torch.Generator().manual_seed(config.seed * 7_919 + trainer.step)
             batch = supply.batch(trainer.step, generator)
-            recent.append(trainer.advance(lambda network: residual_loss(network, batch, generator)))  # type: ignore[arg-type]
+            recent.append(trainer.advance(functools.partial(residual_loss, windows=batch, generator=generator)))
             bar.update(1)
             is_last = trainer.step == config.optimiser.num_steps
             if trainer.step % config.validate_every == 0 or is_last:

@@ -22,8 +22,8 @@ from cadence.types import Detections, HypothesisSet, WindowBatch
 _SAMPLERS = {"rotation": sample_rotation, "ddim": sample_ddim, "dpmpp": sample_dpmpp_2m}
 _MAX_BATCH = 960
 
-CleanHook = Callable[[Tensor, Tensor], Tensor]
-"""(positions [R, K, T, 2] in metres, sigma [R, T]) -> positions: guidance on the clean estimate."""
+CleanHook = Callable[[Tensor, Tensor, slice], Tensor]
+"""(positions [R', K, T, 2] in metres, sigma [R', T], which R' of the active rows) -> positions: guidance of clean estimates."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,6 +35,8 @@ class GeneralModel:
     sampler    "rotation", "ddim" or "dpmpp"
     num_steps  evaluations of the network for each hypothesis
     guide      moves clean estimates, or None
+    bf16       network in bfloat16: about twice as fast where the processor knows it
+    device     of the network; the bank works on the processor
     """
 
     bank: Bank
@@ -43,6 +45,7 @@ class GeneralModel:
     num_steps: int = 6
     guide: CleanHook | None = None
     bf16: bool = False
+    device: str = "cpu"
     name: str = "cadence"
 
     def fit(self, tracks: Detections, step_s: float | None = None) -> "GeneralModel":
@@ -74,16 +77,17 @@ class GeneralModel:
 
     def _denoise_rows(self, noise: Tensor, context: ResidualContext, posterior: BankPosterior, begin: int) -> Tensor:
         network = self.network
-        assert network is not None  # noqa: S101 - `sample` has seen to it
+        assert network is not None
         num_rows, num_hypotheses = noise.shape[:2]
+        context = context.to(self.device)
         code = network.encode(context).repeat_interleave(num_hypotheses, dim=0)
         wide = context.repeated(num_hypotheses)
         rows = slice(begin, begin + num_rows)
         mean, sigma = posterior.mean_m[rows, None], posterior.sigma_m[rows]
 
         def denoise(state: Tensor, angle: float) -> Tensor:
-            level = torch.full((len(state),), angle)
-            with torch.autocast("cpu", dtype=torch.bfloat16, enabled=self.bf16):
+            level = torch.full((len(state),), angle, device=state.device)
+            with torch.autocast(torch.device(self.device).type, dtype=torch.bfloat16, enabled=self.bf16):
                 velocity = network(state, level, wide, code).float()
             return clean_from("v", velocity, state, torch.tensor(angle))
 
@@ -91,10 +95,10 @@ class GeneralModel:
             if self.guide is None:
                 return clean
             scale = sigma[:, None, :, None]
-            position = mean + scale * clean.view(num_rows, num_hypotheses, -1, 2).double()
-            moved = (self.guide(position, sigma) - mean) / scale
-            return moved.float().flatten(0, 1)
+            position = mean + scale * clean.view(num_rows, num_hypotheses, -1, 2).cpu().double()
+            moved = (self.guide(position, sigma, rows) - mean) / scale
+            return moved.float().flatten(0, 1).to(clean.device)
 
-        start = noise.flatten(0, 1)
+        start = noise.flatten(0, 1).to(self.device)
         result = _SAMPLERS[self.sampler](denoise, start, even_angles(self.num_steps), guide)
-        return result.view(num_rows, num_hypotheses, -1, 2)
+        return result.cpu().view(num_rows, num_hypotheses, -1, 2)

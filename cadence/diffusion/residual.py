@@ -49,6 +49,10 @@ class ResidualContext:
         """A selection of windows."""
         return ResidualContext(*(getattr(self, name)[rows] for name in self.__dataclass_fields__))
 
+    def to(self, device: str) -> "ResidualContext":
+        """The same on another device."""
+        return ResidualContext(*(getattr(self, name).to(device) for name in self.__dataclass_fields__))
+
     def repeated(self, times: int) -> "ResidualContext":
         """Every window `times` times in a row: one for each hypothesis."""
         return ResidualContext(*(getattr(self, name).repeat_interleave(times, dim=0) for name in self.__dataclass_fields__))

@@ -43,5 +43,11 @@ def _mirrored(context: ResidualContext, mirror: Tensor) -> ResidualContext:
     d = context.detections
     detections = torch.cat([d[..., :1], _flip(d[..., 1:3], mirror), d[..., 3:]], dim=-1)
     return ResidualContext(
-        _flip(context.mean, mirror), context.sigma, context.since, context.until, context.is_future, detections, context.is_observed
+        _flip(context.mean, mirror),
+        context.sigma,
+        context.since,
+        context.until,
+        context.is_future,
+        detections,
+        context.is_observed,
     )

@@ -1,0 +1,292 @@
+"""Infer: detections → hypotheses: the model fitted to the log, all windows batched, constraints kept."""
+
+import dataclasses
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import pyarrow as pa
+import torch
+from torch import Tensor
+
+from cadence.bank.bank import Bank
+from cadence.bank.hindsight import choose_by_hindsight
+from cadence.bank.rows import active_rows
+from cadence.constraints.obstacles import Obstacles
+from cadence.diffusion.feasible import Feasibility, resampled
+from cadence.diffusion.general import GeneralModel
+from cadence.errors import ConfigError, DeviceError
+from cadence.network.residual import ResidualNetwork, ResidualNetworkConfig
+from cadence.types import Detections, WindowBatch
+from pipeline.checkpoints import DEFAULT, checkpoint_hash, find_checkpoint, load_weights, network_config, read_info
+from pipeline.manifest import StageResult, run_stage
+from pipeline.obstacles import read_obstacles
+from pipeline.progress import Progress
+from pipeline.tables import read_table, write_table
+from pipeline.windows import Grid, GridConfig, MissionWindows, build_windows, fit_tracks, later_detections, plan_grid
+from schemas.tables import WINDOWS, hypotheses_schema
+
+_ROWS_AT_ONCE = 48
+_HINDSIGHT_ROWS = 64
+
+ADVICE = {
+    "ok": None,
+    "no_detections": "not detected within this window's history; infer.grid.history_steps or step_s would widen it",
+    "infeasible": "no way around an obstacle between detections; check the obstacles, or lower infer.guidance.margin_m",
+    "guidance_diverged": "sampling did not stay finite, so the bank's samples stand in; report this log",
+}
+"""What to do about each status of a window."""
+
+
+@dataclass(frozen=True)
+class GuidanceConfig:
+    """How constraints act on hypotheses.
+
+    mode           "clean" guides while sampling and repairs at the end; "repair" only repairs; "none" ignores constraints
+    margin_m       distance to keep from obstacles
+    max_speed_mps  a speed that the target cannot exceed; None = no limit
+    """
+
+    mode: Literal["clean", "repair", "none"] = "clean"
+    margin_m: float = 0.0
+    max_speed_mps: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.margin_m < 0 or (self.max_speed_mps is not None and not self.max_speed_mps > 0):
+            raise ValueError("margin_m must not be negative, max_speed_mps must be positive")
+
+
+@dataclass(frozen=True)
+class InferConfig:
+    """How hypotheses are drawn.
+
+    num_hypotheses   for each window
+    seed             of all random numbers
+    checkpoint       a .safetensors file, the name of a shipped one, or "none" for the bank alone
+    sampler          "rotation", "ddim" or "dpmpp"
+    num_steps        evaluations of the network a hypothesis
+    default_sigma_m  accuracy of detections that state none
+    device           "auto", "cpu" or "cuda"
+    """
+
+    num_hypotheses: int = 30
+    seed: int = 0
+    checkpoint: str = DEFAULT
+    sampler: Literal["rotation", "ddim", "dpmpp"] = "rotation"
+    num_steps: int = 6
+    default_sigma_m: float = 0.0
+    device: str = "auto"
+    grid: GridConfig = field(default_factory=GridConfig)
+    guidance: GuidanceConfig = field(default_factory=GuidanceConfig)
+
+    def __post_init__(self) -> None:
+        if self.num_hypotheses < 1 or self.num_steps < 1 or self.default_sigma_m < 0:
+            raise ValueError("num_hypotheses and num_steps must be at least 1, default_sigma_m not negative")
+
+
+def infer(directory: Path, config: InferConfig, progress: Progress, force: bool = False) -> StageResult:
+    """Draw hypotheses for every window of the mission in `directory`: hypotheses.parquet and windows.parquet."""
+    weights = None if config.checkpoint == "none" else find_checkpoint(config.checkpoint)
+    inputs = [directory / "detections.parquet", directory / "obstacles.json"]
+    if weights is not None:
+        inputs += [weights, weights.with_suffix(".json")]
+    for path in inputs[:1]:
+        read_table(path, "detections")
+
+    def body(folder: Path) -> dict[str, Any]:
+        detections, frame = read_table(directory / "detections.parquet", "detections")
+        obstacles = read_obstacles(directory / "obstacles.json")
+        grid = plan_grid(detections, config.grid)
+        windows = build_windows(detections, grid, config.seed, config.default_sigma_m)
+        model = fitted_model(config, detections, grid, windows, weights)
+        log_id = str(detections["log_id"][0])
+        parts, statuses = [], []
+        with progress.bar(windows.batch.num_windows, "infer", unit="window") as bar:
+            for part, positions, weight, status in draw_hypotheses(model, windows, config, obstacles):
+                parts.append(_hypothesis_rows(log_id, windows, grid, part, positions, weight))
+                statuses.append(_window_rows(windows, part, positions, weight, status))
+                bar.update(len(part))
+        table = pa.concat_tables(parts)
+        window_table = pa.concat_tables(statuses)
+        write_table(table, folder / "hypotheses.parquet", "hypotheses", frame)
+        write_table(window_table, folder / "windows.parquet", "windows", frame)
+        counts = window_table["status"].value_counts().to_pylist()
+        return {
+            "num_windows": windows.batch.num_windows,
+            "num_agents": len(windows.agent_ids),
+            "num_tracks": table.num_rows,
+            "status": {str(item["values"]): int(item["counts"]) for item in counts},
+            "step_s": grid.step_s,
+            "checkpoint": config.checkpoint,
+            "checkpoint_sha256": None if weights is None else checkpoint_hash(weights),
+            "seed": config.seed,
+            **_model_summary(model),
+        }
+
+    return run_stage("infer", directory, config=config, inputs=inputs, body=body, force=force)
+
+
+def load_model(config: InferConfig, weights: Path | None) -> GeneralModel:
+    """The model before it has seen a log; `ConfigError` where the checkpoint is of another kind or does not fit."""
+    device = _device(config.device)
+    network = None
+    if weights is not None:
+        info = read_info(weights)
+        if info.preset != "general":
+            raise ConfigError(f"{weights}: a checkpoint of the {info.preset} preset; infer wants one of the general preset")
+        network = ResidualNetwork(network_config(ResidualNetworkConfig, info, weights))
+        load_weights(weights, network)
+        network.eval().to(device)
+    return GeneralModel(Bank(), network, config.sampler, config.num_steps, device=device)
+
+
+def fitted_model(
+    config: InferConfig, detections: pa.Table, grid: Grid, windows: MissionWindows, weights: Path | None
+) -> GeneralModel:
+    """The model with its bank fitted to the log's detections, the settings of the bank chosen by hindsight."""
+    model = load_model(config, weights)
+    bank = fitted_bank(fit_tracks(detections, grid, config.default_sigma_m), detections, grid, windows, config.default_sigma_m)
+    return dataclasses.replace(model, bank=bank)
+
+
+def fitted_bank(
+    tracks: Detections, detections: pa.Table, grid: Grid, windows: MissionWindows, default_sigma_m: float = 0.0
+) -> Bank:
+    """The bank fitted to a log: weights by likelihood, the choice among its settings by hindsight on later detections."""
+    bank = Bank().fit(tracks, grid.step_s)
+    later = later_detections(detections, grid, windows, default_sigma_m)
+    # evenly spread windows in which something is known before the origin and after it
+    useful = (windows.batch.is_active & later.is_observed.any(-1)).sum(1)
+    order = torch.nonzero(useful)[:, 0]
+    if len(order) == 0:
+        return bank
+    num = max(1, int(_HINDSIGHT_ROWS / float(useful[order].double().mean())))
+    chosen = order[torch.linspace(0, len(order) - 1, min(num, len(order))).round().long()]
+    return choose_by_hindsight(bank, windows.batch[chosen], later[chosen])
+
+
+def draw_hypotheses(
+    model: GeneralModel, windows: MissionWindows, config: InferConfig, obstacles: Obstacles
+) -> Iterator[tuple[Tensor, Tensor, Tensor, list[list[str]]]]:
+    """Windows in chunks: their indices, positions [B', K, A, T, 2] about the datum, weights [B', K], status [B'][A]."""
+    batch = windows.batch
+    datum = torch.from_numpy(windows.datum_m)
+    per_window = batch.is_active.sum(1).clamp_min(1)
+    chunk_of = (per_window.cumsum(0) - 1) // _ROWS_AT_ONCE
+    for chunk in range(int(chunk_of[-1]) + 1):
+        part = torch.nonzero(chunk_of == chunk)[:, 0]
+        if len(part):
+            yield part, *_draw_part(model, batch[part], datum[part], config, obstacles)
+
+
+def _draw_part(
+    model: GeneralModel, batch: WindowBatch, datum_m: Tensor, config: InferConfig, obstacles: Obstacles
+) -> tuple[Tensor, Tensor, list[list[str]]]:
+    active = batch.is_active
+    limits = Feasibility(obstacles, config.guidance.margin_m, config.guidance.max_speed_mps, batch.step_s, torch.zeros(0))
+    limits = limits.for_rows(datum_m[active.nonzero()[:, 0]])
+    is_limited = obstacles.count > 0 or config.guidance.max_speed_mps is not None
+    guided = dataclasses.replace(model, guide=limits.guide if is_limited and config.guidance.mode == "clean" else None)
+    drawn = guided.sample(batch, config.num_hypotheses)
+    position, weight = drawn.position_m, drawn.weight
+    status = [list(row) for row in drawn.status]
+    rows = position.transpose(1, 2)[active]
+    is_finite = torch.isfinite(rows).flatten(1).all(1)
+    if not bool(is_finite.all()):
+        rows = torch.where(is_finite[:, None, None, None], rows, model.bank.posterior(batch, config.num_hypotheses).sample_m)
+    if config.guidance.mode != "none" and len(rows):
+        sigma = model.bank.posterior(batch, 1).sigma_m if obstacles.count else torch.ones(rows.shape[0], rows.shape[2])
+        rows, row_weight, is_feasible = limits.finish(rows, sigma, model.bank.length_m(batch.step_s))
+        if batch.num_agents == 1:
+            weight = weight.clone()
+            weight[active[:, 0]] = row_weight
+        else:
+            rows = resampled(rows, row_weight, active_rows(batch)[1])
+    else:
+        is_feasible = torch.ones(rows.shape[:2], dtype=torch.bool)
+    for row, (b, a) in enumerate(active.nonzero().tolist()):
+        if not bool(is_finite[row]):
+            status[b][a] = "guidance_diverged"
+        elif not bool(is_feasible[row].all()):
+            status[b][a] = "infeasible"
+    position = torch.full_like(position.transpose(1, 2), math.nan)
+    position[active] = rows
+    return position.transpose(1, 2), weight, status
+
+
+def _hypothesis_rows(
+    log_id: str, windows: MissionWindows, grid: Grid, part: Tensor, position: Tensor, weight: Tensor
+) -> pa.Table:
+    """HYPOTHESES rows of the active agents, by window, hypothesis, agent."""
+    active = windows.batch.is_active[part]
+    b, k, a, t = position.shape[:4]
+    is_row = active[:, None, :].expand(b, k, a)
+    window, hypothesis, agent = (index.numpy() for index in is_row.nonzero(as_tuple=True))
+    which = part.numpy()[window]
+    flat = pa.array(position[is_row].float().numpy().reshape(-1))
+    pairs = pa.FixedSizeListArray.from_arrays(pa.FixedSizeListArray.from_arrays(flat, 2), t)
+    num = len(window)
+    agents = pa.DictionaryArray.from_arrays(pa.array(agent.astype(np.int32)), pa.array(windows.agent_ids)).cast(pa.string())
+    columns = [
+        pa.array([log_id] * num, pa.string()),
+        pa.array(which.astype(np.int32)),
+        pa.array(windows.origins_ns[which]),
+        pa.array(np.full(num, grid.step_ns)),
+        pa.array(np.full(num, grid.origin_index, dtype=np.int32)),
+        agents,
+        pa.array(hypothesis.astype(np.int32)),
+        pa.array(weight.numpy()[window, hypothesis].astype(np.float32)),
+        pa.array(windows.datum_m[which, 0]),
+        pa.array(windows.datum_m[which, 1]),
+        pairs,
+    ]
+    schema = hypotheses_schema(t)
+    return pa.Table.from_arrays([column.cast(item.type) for column, item in zip(columns, schema, strict=True)], schema=schema)
+
+
+def _window_rows(windows: MissionWindows, part: Tensor, position: Tensor, weight: Tensor, status: list[list[str]]) -> pa.Table:
+    """WINDOWS rows of every agent."""
+    origin = position[:, :, :, windows.batch.origin_index]
+    mean = (weight[:, :, None, None] * origin).sum(1, keepdim=True)
+    spread = (weight[:, :, None] * ((origin - mean) ** 2).sum(-1)).sum(1).sqrt()
+    detections = windows.batch.detections[part]
+    age = -torch.where(detections.is_observed, detections.time_s, -torch.inf).amax(-1)
+    rows = []
+    for index, window in enumerate(part.tolist()):
+        for a, agent in enumerate(windows.agent_ids):
+            is_active = bool(detections.is_observed[index, a].any())
+            rows.append(
+                {
+                    "window": window,
+                    "origin_ns": int(windows.origins_ns[window]),
+                    "agent_id": agent,
+                    "status": status[index][a],
+                    "advice": ADVICE[status[index][a]],
+                    "num_detections": int(detections.count[index, a]),
+                    "age_s": float(age[index, a]) if is_active else None,
+                    "spread_m": float(spread[index, a]) if is_active else None,
+                }
+            )
+    return pa.Table.from_pylist(rows, schema=WINDOWS)
+
+
+def _model_summary(model: GeneralModel) -> dict[str, Any]:
+    bank = model.bank
+    return {
+        "sampler": model.sampler,
+        "num_steps": model.num_steps if model.network is not None else 0,
+        "bank": {"speed_mps": bank.speed_mps, "switch_rate": bank.switch_rate, "num_models": len(bank.models)},
+    }
+
+
+def _device(name: str) -> str:
+    if name == "auto":
+        return "cuda" if torch.cuda.is_available() else "cpu"
+    try:
+        torch.zeros(1, device=name)
+    except (RuntimeError, AssertionError) as error:
+        raise DeviceError(f"infer.device {name!r}: not to be had here ({str(error).splitlines()[0]}); use cpu") from error
+    return name
