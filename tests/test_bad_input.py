@@ -10,7 +10,7 @@ from logs_fixture import Fix, straight_line, write_log
 
 import cli
 
-FAST = ["--set", "infer.num_hypotheses=4", "--set", "infer.grid.stride_steps=64", "--quiet"]
+FAST = ["--set", "infer.checkpoint=none", "--set", "infer.num_hypotheses=4", "--set", "infer.grid.stride_steps=64", "--quiet"]
 STAGE_FILES = {
     "ingest": {"catalogue.json"},
     "extract": {"detections.parquet", "truth.parquet", "poses.parquet", "obstacles.json"},
@@ -162,6 +162,26 @@ def test_unknown_configuration_key_is_refused_before_anything_is_written(tmp_pat
     assert not out.exists()
 
 
+@pytest.mark.parametrize(
+    ("weights", "description"),
+    [
+        (None, None),
+        (b"not safetensors", b"{}"),
+        (b"", b"not json"),
+        (b"\x02\0\0\0\0\0\0\0{}", b'{"preset": "general", "network": {}, "format": 1}'),
+    ],
+    ids=["absent", "damaged", "not json", "other network"],
+)
+def test_checkpoint_that_does_not_fit_is_refused(weights, description, tmp_path, out, capsys):
+    checkpoint = tmp_path / "net.safetensors"
+    if weights is not None:
+        checkpoint.write_bytes(weights)
+        checkpoint.with_suffix(".json").write_bytes(description)
+    log = write_log(tmp_path / "ok.mcap", straight_line())
+    assert_refused(run(capsys, log, out, "--set", f"infer.checkpoint={checkpoint}"), 4, "net")
+    assert_no_partial_files(out)
+
+
 def test_folder_that_is_a_file_is_refused(tmp_path, capsys):
     log = write_log(tmp_path / "ok.mcap", straight_line())
     (tmp_path / "file").write_text("not a folder")
@@ -191,7 +211,8 @@ def test_a_bad_log_among_good_ones_costs_only_itself(tmp_path, out, capsys):
 @pytest.mark.parametrize("command", ["extract", "infer", "export", "report", "evaluate"])
 def test_stage_without_what_it_needs_says_which_stage_to_run(command, tmp_path, capsys):
     (tmp_path / "mission").mkdir()
-    code = cli.main([command, str(tmp_path / "mission"), "--quiet"])
+    settings = ["--set", "infer.checkpoint=none"] if command == "infer" else []
+    code = cli.main([command, str(tmp_path / "mission"), "--quiet", *settings])
     captured = capsys.readouterr()
     assert_refused((code, captured.err, None), 3)
     assert captured.out == "" and list((tmp_path / "mission").iterdir()) == []
