@@ -4,7 +4,7 @@ Reads hypotheses, windows, detections and truth (*.parquet); writes scores.json 
 for a spreadsheet) and scores.md (what a person reads first). `evaluate_folder` pools the missions of a folder.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,19 +15,18 @@ import pyarrow.compute as pc
 import torch
 from torch import Tensor
 
-from cadence.bank.bank import Bank
-from cadence.baselines.interpolation import Hold, LinearInterpolation
 from cadence.constraints.checker import segments_in_collision, states_in_collision
 from cadence.errors import CadenceError, InputError
-from cadence.types import Detections, Estimator, HypothesisSet
+from cadence.types import HypothesisSet
 from pipeline.manifest import StageResult, read_manifest, run_stage, write_atomic
 from pipeline.obstacles import OBSTACLES_NAME, read_obstacles
 from pipeline.progress import Progress
 from pipeline.results import MissionHypotheses, read_hypothesis_tables
+from pipeline.rivals import RIVALS, FittingData
 from pipeline.score_tables import OWN_NAME, ScoredMission, as_csv, as_json, as_markdown, headline, pool
 from pipeline.scores import IsInside, compare, score_in_chunks
 from pipeline.tables import read_table
-from pipeline.windows import UNKNOWN_AGENT, Grid, MissionWindows, build_windows, fit_tracks, truth_on_grid
+from pipeline.windows import UNKNOWN_AGENT, Grid, MissionWindows, build_windows, truth_on_grid
 
 _TRUTH_GAP_STEPS = 2.0
 
@@ -36,14 +35,14 @@ _TRUTH_GAP_STEPS = 2.0
 class EvaluateConfig:
     """What is scored, and beside whom.
 
-    rivals           names out of `RIVALS`, fitted to the mission's detections; an empty list scores the hypotheses alone
+    rivals           out of `pipeline.rivals.RIVALS`, fitted to the mission's detections; empty: the hypotheses alone
     max_truth_gap_s  truth is interpolated between samples at most this far apart; by default two steps, or twice the median
                      time between truth samples where that is longer
     num_resamples    bootstrap resamples of an interval
     seed             of the rivals' samples and of the bootstrap
     """
 
-    rivals: tuple[str, ...] = ("bank", "linear", "hold")
+    rivals: tuple[str, ...] = ("bank", "cv", "ou", "linear", "hold")
     max_truth_gap_s: float | None = None
     num_resamples: int = 1000
     seed: int = 0
@@ -56,14 +55,6 @@ class EvaluateConfig:
             raise ValueError(f"max_truth_gap_s must be positive, got {self.max_truth_gap_s}")
         if self.num_resamples < 1:
             raise ValueError(f"num_resamples must be at least 1, got {self.num_resamples}")
-
-
-RIVALS: Mapping[str, Callable[[Detections, float], Estimator]] = {
-    "bank": lambda tracks, step_s: Bank().fit(tracks, step_s),
-    "linear": lambda tracks, step_s: LinearInterpolation().fit(tracks),
-    "hold": lambda tracks, step_s: Hold().fit(tracks),
-}
-"""Rivals by name: fitted to stretches of detections [R, 1, N] for windows of the given step."""
 
 
 def evaluate(directory: Path, config: EvaluateConfig, progress: Progress, force: bool = False) -> StageResult:
@@ -113,7 +104,7 @@ def score_mission(directory: Path, config: EvaluateConfig, progress: Progress) -
     detections, _ = read_table(directory / "detections.parquet", "detections")
     truth, _ = read_table(directory / "truth.parquet", "truth")
     grid = _stored_grid(stored, directory)
-    sigma_m = _default_sigma_m(directory)
+    sigma_m = _infer_setting(directory, "default_sigma_m") or 0.0
     windows = build_windows(detections, grid, config.seed, sigma_m)
     truth = _named_like(truth, windows.agent_ids, directory)
     max_gap_s = config.max_truth_gap_s or default_truth_gap_s(truth, grid.step_s)
@@ -133,8 +124,8 @@ def score_mission(directory: Path, config: EvaluateConfig, progress: Progress) -
             )
         is_scored = torch.zeros(is_known.shape[:2], dtype=torch.bool)
         is_scored[torch.from_numpy(own.window.astype(np.int64)), torch.from_numpy(own.agent.astype(np.int64))] = True
-        tracks = fit_tracks(detections, grid, sigma_m)
-        rivals = {name: RIVALS[name](tracks, grid.step_s) for name in config.rivals}
+        data = FittingData.of(detections, grid, windows, sigma_m)
+        rivals = {name: RIVALS[name](data) for name in config.rivals}
         cells = compare(rivals, windows.batch, truth_m, is_known & is_scored[..., None], num_hypotheses, collides, bar.update)
     is_asked = is_known.any(dim=-1) & windows.batch.is_active
     return ScoredMission(
@@ -166,7 +157,11 @@ def _stored_grid(stored: MissionHypotheses, directory: Path) -> Grid:
         raise InputError(f"{directory}: there are no hypotheses to score; see windows.parquet (status, advice) for the reasons")
     origins_ns = np.array([window.origin_ns for window in stored.windows], dtype=np.int64)
     first = drawn[0]
-    return Grid(first.step_ns, first.origin_index + 1, first.num_steps - first.origin_index - 1, origins_ns)
+    context_steps = _infer_setting(directory, "grid", "context_steps")
+    return Grid(
+        first.step_ns, first.origin_index + 1, first.num_steps - first.origin_index - 1, origins_ns,
+        None if context_steps is None else int(context_steps),
+    )  # fmt: skip
 
 
 def _collision_test(directory: Path, windows: MissionWindows) -> IsInside | None:
@@ -185,11 +180,12 @@ def _collision_test(directory: Path, windows: MissionWindows) -> IsInside | None
     return collides
 
 
-def _default_sigma_m(directory: Path) -> float:
-    """The accuracy that infer gave to detections without covariance: rivals get the same."""
-    manifest = read_manifest("infer", directory) or {}
-    value = manifest.get("config", {}).get("default_sigma_m", 0.0)
-    return float(value) if isinstance(value, int | float) else 0.0
+def _infer_setting(directory: Path, *path: str) -> float | None:
+    """A number out of the configuration that infer ran with: rivals are given the same."""
+    value: Any = (read_manifest("infer", directory) or {}).get("config")
+    for key in path:
+        value = value.get(key) if isinstance(value, dict) else None
+    return float(value) if isinstance(value, int | float) else None
 
 
 def _named_like(truth: pa.Table, agent_ids: tuple[str, ...], directory: Path) -> pa.Table:
