@@ -37,28 +37,38 @@ class GridConfig:
     history_steps  steps up to and including the origin
     horizon_steps  steps after it
     stride_steps   steps from one origin to the next
+    context_steps  detections from this many steps before the origin on are used; by default from the first step on
     """
 
     step_s: float | None = None
     history_steps: int = 64
     horizon_steps: int = 32
     stride_steps: int = 16
+    context_steps: int | None = None
 
     def __post_init__(self) -> None:
         if self.step_s is not None and not self.step_s > 0:
             raise ValueError(f"step_s must be positive, got {self.step_s}")
         if min(self.history_steps, self.stride_steps) < 1 or self.horizon_steps < 0:
             raise ValueError("history_steps and stride_steps must be at least 1, horizon_steps at least 0")
+        if self.context_steps is not None and self.context_steps < self.history_steps:
+            raise ValueError(f"context_steps is {self.context_steps}, less than history_steps {self.history_steps}")
 
 
 @dataclass(frozen=True, eq=False)
 class Grid:
-    """Resolved grid: `origins_ns` [B] and the steps around each."""
+    """Resolved grid: `origins_ns` [B] and the steps around each; detections reach back `context_steps` (None: the history)."""
 
     step_ns: int
     history_steps: int
     horizon_steps: int
     origins_ns: Int64s
+    context_steps: int | None = None
+
+    @property
+    def context_ns(self) -> int:
+        """How far before the origin detections are used."""
+        return (self.context_steps or self.history_steps) * self.step_ns
 
     @property
     def step_s(self) -> float:
@@ -114,7 +124,7 @@ def plan_grid(detections: pa.Table, config: GridConfig) -> Grid:
     if num_windows > 1_000_000:
         raise ConfigError(f"infer.grid: {num_windows} windows of step {step_s:g} s; choose a larger step_s or stride_steps")
     origins = first + stride_ns * np.arange(1, num_windows + 1, dtype=np.int64)
-    return Grid(step_ns, config.history_steps, config.horizon_steps, origins)
+    return Grid(step_ns, config.history_steps, config.horizon_steps, origins, config.context_steps)
 
 
 def suggest_step_s(times_ns: list[Int64s]) -> float:
@@ -141,8 +151,7 @@ def build_windows(detections: pa.Table, grid: Grid, seed: int, default_sigma_m: 
     `default_sigma_m` is the accuracy of detections without covariance (the estimators add their own small floor).
     """
     tracks = _kept_tracks(detections, grid, default_sigma_m)
-    history_ns = grid.history_steps * grid.step_ns
-    columns = _slice_tracks(tracks, grid.origins_ns, grid.origins_ns - history_ns, grid.origins_ns)
+    columns = _slice_tracks(tracks, grid.origins_ns, grid.origins_ns - grid.context_ns, grid.origins_ns)
     observed = columns.is_observed.numpy()
     count = observed.sum(axis=(1, 2))
     datum = columns.position_m.numpy().sum(axis=(1, 2)) / np.maximum(count, 1)[:, None]
@@ -197,11 +206,11 @@ def window_seeds(seed: int, num_windows: int) -> Tensor:
 
 
 def fit_tracks(detections: pa.Table, grid: Grid, default_sigma_m: float = 0.0) -> Detections:
-    """Every agent's detections cut into stretches of a history's length, one a row [R, 1, N]: what estimators are fitted to.
+    """Every agent's detections cut into stretches of a window's context, one a row [R, 1, N]: what estimators are fitted to.
 
     Times are seconds since the first detection of the stretch, positions metres relative to it.
     """
-    length_ns = grid.history_steps * grid.step_ns
+    length_ns = grid.context_ns
     pieces: list[_AgentTrack] = []
     for _, track in _agent_tracks(detections, default_sigma_m):
         kept = _one_per_cell(track, grid)
