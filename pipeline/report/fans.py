@@ -39,7 +39,7 @@ FEWEST_WINDOWS = 12
 
 def choose_detail(mission: Mission, budget_bytes: float, wanted: Detail) -> Detail:
     """The finest detail within the budget: first fewer hypotheses and vertices, then windows, then agents."""
-    density = len(mission.fans) / max(1, len(mission.origins_ns) * len(mission.agents))
+    density = len(mission.fans) / max(1, wanted.num_windows * wanted.num_agents)
     detail = wanted
     for num_hypotheses, num_vertices in ((wanted.num_hypotheses, wanted.num_vertices), *LADDER):
         detail = replace(

@@ -24,6 +24,9 @@ Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 JsonDict = dict[str, Any]
 
+UNKNOWN_AGENT = "unknown"
+"""The agent to which infer gives detections of unknown origin (`pipeline.windows`, whose import would load torch)."""
+
 STAGES = ("ingest", "extract", "infer", "export", "evaluate")
 """Stages whose manifests the page shows, in the order of the work."""
 
@@ -130,6 +133,17 @@ class Mission:
     log_end_ns: int
 
     @property
+    def num_tracked(self) -> int:
+        """Agents that infer has looked at; the others are only in the truth."""
+        return len({row.agent for row in self.rows})
+
+    @property
+    def drawn_windows(self) -> list[int]:
+        """Windows with hypotheses of at least one agent, in the order of time; all where none has any."""
+        drawn = {fan.window for fan in self.fans}
+        return [window for window in self.origins_ns if window in drawn or not drawn]
+
+    @property
     def origins_ns(self) -> dict[int, int]:
         """Origin by window, in the order of time."""
         return dict(sorted({row.window: row.origin_ns for row in self.rows}.items(), key=lambda item: (item[1], item[0])))
@@ -155,7 +169,7 @@ def load_mission(directory: Path) -> Mission:
     rows = _window_rows(hypotheses, agents)
     scores = directory / "scores.json"
     manifests = {stage: found for stage in STAGES if (found := read_manifest(stage, directory)) is not None}
-    detection_points = _points(detections, "agent_id", agents)
+    detection_points = _points(detections, "agent_id", agents, UNKNOWN_AGENT if UNKNOWN_AGENT in hypotheses.agent_ids else None)
     truth_points = _points(truth, "agent_id", agents) if truth is not None else None
     start_ns, end_ns = _time_range(catalogue, [points for points in (detection_points, truth_points) if points], rows)
     log_start_ns, log_end_ns = _log_range(catalogue, start_ns, end_ns)
@@ -223,10 +237,11 @@ def _index(column: pa.ChunkedArray, names: tuple[str, ...]) -> Ints:
     return np.asarray(lookup[encoded.indices.fill_null(len(lookup) - 1).to_numpy(zero_copy_only=False)])
 
 
-def _points(table: pa.Table, column: str, names: tuple[str, ...]) -> Points:
+def _points(table: pa.Table, column: str, names: tuple[str, ...], stand_in: str | None = None) -> Points:
+    """Finite positions by time; owners that are null become `stand_in`."""
     position_m = np.column_stack([table["x_m"].to_numpy(), table["y_m"].to_numpy()]).astype(np.float64).reshape(-1, 2)
     time_ns = table["time_ns"].to_numpy().astype(np.int64)
-    owner = _index(table[column], names)
+    owner = _index(table[column] if stand_in is None else table[column].fill_null(stand_in), names)
     usable = np.isfinite(position_m).all(axis=1)
     order = np.argsort(time_ns[usable], kind="stable")
     return Points(time_ns[usable][order], owner[usable][order], position_m[usable][order])
@@ -297,7 +312,7 @@ def _log_name(catalogue: JsonDict, directory: Path) -> str:
 def _time_range(catalogue: JsonDict, points: list[Points], rows: tuple[WindowRow, ...]) -> tuple[int, int]:
     times = [int(time) for found in points if len(found) for time in (found.time_ns[0], found.time_ns[-1])]
     times += [rows[0].origin_ns, rows[-1].origin_ns] if rows else []
-    return (min(times), max(times)) if times else _log_range(catalogue, 0, 0)
+    return (min(times), max(times)) if times else (int(catalogue.get("start_ns") or 0), int(catalogue.get("end_ns") or 0))
 
 
 def _log_range(catalogue: JsonDict, start_ns: int, end_ns: int) -> tuple[int, int]:
@@ -306,4 +321,4 @@ def _log_range(catalogue: JsonDict, start_ns: int, end_ns: int) -> tuple[int, in
     if not isinstance(first, int) or not isinstance(last, int):
         return start_ns, end_ns
     is_same_clock = first <= end_ns and start_ns <= last
-    return (first, last) if is_same_clock or start_ns == end_ns else (start_ns, end_ns)
+    return (first, last) if is_same_clock else (start_ns, end_ns)

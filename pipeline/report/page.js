@@ -506,6 +506,6 @@
   addEventListener("afterprint", () => { state.isPrinting = false; draw(); });
   new ResizeObserver(draw).observe(canvas);
   width = canvas.clientWidth || 1; height = canvas.clientHeight || 1;
-  setWindow(Math.floor(data.window.length / 2));
+  setWindow(data.first_window);
   fitAll();
 })();

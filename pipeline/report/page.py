@@ -11,7 +11,7 @@ from pipeline.report.analysis import Analysis, Moment, share_of_steps
 from pipeline.report.clock import Clock, duration
 from pipeline.report.health import health_section
 from pipeline.report.markup import inline_json, legend, section, text
-from pipeline.report.mission import Mission
+from pipeline.report.mission import UNKNOWN_AGENT, Mission
 from pipeline.report.payload import Payload
 from pipeline.report.provenance import provenance_section
 from pipeline.report.sections import moments_section, trouble_section, uncertainty_section
@@ -88,9 +88,13 @@ def _header(mission: Mission) -> str:
 
 def _facts(mission: Mission) -> list[tuple[str, str, str]]:
     share = share_of_steps(mission)
-    unknown = int((mission.detections.owner < 0).sum())
+    is_unknown = mission.detections.owner < 0
+    if UNKNOWN_AGENT in mission.agents:
+        is_unknown |= mission.detections.owner == mission.agents.index(UNKNOWN_AGENT)
+    unknown = int(is_unknown.sum())
+    others = len(mission.agents) - mission.num_tracked
     facts = [
-        ("Agents", f"{len(mission.agents):,}", ""),
+        ("Agents", f"{mission.num_tracked:,}", f"{others:,} more only in the truth" if others else ""),
         ("Detections", f"{len(mission.detections):,}", f"{unknown:,} without a known agent" if unknown else ""),
     ]
     if not mission.fans:
@@ -141,6 +145,8 @@ def _explorer(mission: Mission, payload: Payload) -> str:
     layers += [("sensors", "Sensors")] if mission.poses is not None else []
     boxes = "".join(f'<label><input type="checkbox" data-layer="{name}" checked> {words}</label>' for name, words in layers)
     note = f"To keep this file small, the map shows {'; '.join(payload.notes)}." if payload.notes else ""
+    skipped = len(mission.origins_ns) - len(mission.drawn_windows)
+    note += f" {skipped:,} windows without any hypotheses are skipped." if skipped else ""
     content = Template(_asset("explorer.html")).substitute(layers=boxes, note=text(note))
     # Without scripts the section is hidden, and the drawings below stand for it.
     return section("Map", content, kind="only-script")

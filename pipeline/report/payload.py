@@ -4,6 +4,7 @@ Everything that is shown less finely than it was computed is named in `Payload.n
 """
 
 import base64
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -51,6 +52,7 @@ def build_payload(
         "origin_s": [_seconds(mission, mission.origins_ns[window]) for window in windows],
         "cells": [[_cell(rows.get((window, agent))) for agent in agents] for window in windows],
         "shown_share": shown_share,
+        "first_window": _fullest(codes, windows),
         "step_s": first.step_ns / 1e9 if first else 1.0,
         "origin_index": first.origin_index if first else 0,
         "num_steps": int(first.offset_m.shape[1]) if first else 1,
@@ -77,18 +79,26 @@ def build_payload(
 
 def _notes(mission: Mission, codes: Sequence[FanCode], windows: Sequence[int], agents: Sequence[int]) -> list[str]:
     notes = []
-    if len(windows) < len(mission.origins_ns):
-        notes.append(f"{len(windows)} of {len(mission.origins_ns)} windows")
+    drawn = mission.drawn_windows
+    if len(windows) < len(drawn):
+        notes.append(f"{len(windows)} of {len(drawn)} windows")
     if len(agents) < len(mission.agents):
         notes.append(f"{len(agents)} of {len(mission.agents)} agents, those with the most detections")
     if codes and mission.fans:
-        shown, drawn = max(len(code.weight) for code in codes), max(len(fan.weight) for fan in mission.fans)
-        if shown < drawn:
-            notes.append(f"the {shown} heaviest of {drawn} hypotheses (means and envelopes use all)")
-        shown, drawn = max(len(code.step) for code in codes), max(fan.offset_m.shape[1] for fan in mission.fans)
-        if shown < drawn:
-            notes.append(f"{shown} vertices for {drawn} steps a hypothesis")
+        shown, computed = max(len(code.weight) for code in codes), max(len(fan.weight) for fan in mission.fans)
+        if shown < computed:
+            notes.append(f"the {shown} heaviest of {computed} hypotheses (means and envelopes use all)")
+        shown, computed = max(len(code.step) for code in codes), max(fan.offset_m.shape[1] for fan in mission.fans)
+        if shown < computed:
+            notes.append(f"{shown} vertices for {computed} steps a hypothesis")
     return notes
+
+
+def _fullest(codes: Sequence[FanCode], windows: Sequence[int]) -> int:
+    """Place of the window with the most agents; of several the one nearest to the middle of the mission."""
+    count = Counter(code.window for code in codes)
+    middle = (len(windows) - 1) / 2
+    return max(range(len(windows)), key=lambda place: (count[windows[place]], -abs(place - middle)), default=0)
 
 
 def _centre(mission: Mission) -> Floats:

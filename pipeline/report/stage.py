@@ -97,7 +97,7 @@ def _analyse(mission: Mission, bar: "tqdm[Any]") -> Analysis:
 
 
 def _payload(mission: Mission, config: ReportConfig, moments: Sequence[Moment], bar: "tqdm[Any]") -> Payload:
-    wanted = Detail(len(mission.origins_ns), len(mission.agents), config.max_hypotheses, config.max_vertices)
+    wanted = Detail(len(mission.drawn_windows), len(mission.agents), config.max_hypotheses, config.max_vertices)
     detail = choose_detail(mission, _budget_bytes(mission, config), wanted)
     windows = _shown_windows(mission, detail.num_windows, [mission.fans[moment.fan].window for moment in moments])
     agents = _shown_agents(mission, detail.num_agents)
@@ -121,7 +121,7 @@ def _budget_bytes(mission: Mission, config: ReportConfig) -> float:
 
 def _shown_windows(mission: Mission, count: int, always: Sequence[int]) -> list[int]:
     """`count` windows evenly over the mission, and those `always` shown in place of their neighbours."""
-    windows = list(mission.origins_ns)
+    windows = mission.drawn_windows
     if count >= len(windows):
         return windows
     chosen = np.unique(np.linspace(0, len(windows) - 1, count).round().astype(int))
