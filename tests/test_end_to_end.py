@@ -1,0 +1,105 @@
+"""From a log to what a person opens: everything is there, readable by others, repeatable, and the log itself is untouched."""
+
+import json
+from collections import Counter
+from pathlib import Path
+
+import pytest
+from logs_fixture import straight_line, write_log
+from mcap.reader import make_reader
+
+import cli
+from pipeline.manifest import hash_file
+
+ROOT = Path(__file__).resolve().parents[1]
+SHIPPED = sorted((ROOT / "cadence" / "checkpoints").glob("*.safetensors"))
+SMALL = ["--set", "infer.num_hypotheses=5", "--set", "infer.grid.stride_steps=32", "--json", "--quiet"]
+BANK = ["--set", "infer.checkpoint=none"]
+RESULTS = (
+    "detections.parquet",
+    "hypotheses.parquet",
+    "windows.parquet",
+    "walk.cadence.mcap",
+    "walk.layout.json",
+    "report.html",
+)
+
+
+def run(capsys, log: Path, out: Path, *more: str) -> list[dict]:
+    assert cli.main(["run", str(log), "--out", str(out), *SMALL, *more]) == 0
+    captured = capsys.readouterr()
+    assert captured.err == ""
+    return json.loads(captured.out)
+
+
+@pytest.fixture
+def log(tmp_path):
+    return write_log(tmp_path / "walk.mcap", straight_line(10))
+
+
+def test_all_results_are_there_and_the_log_is_untouched(log, tmp_path, capsys):
+    before = hash_file(log)
+    (record,) = run(capsys, log, tmp_path / "out", *BANK)
+    assert [stage["stage"] for stage in record["stages"]] == ["ingest", "extract", "infer", "export", "report"]
+    assert record["error"] is None and {stage["status"] for stage in record["stages"]} == {"done"}
+    mission = tmp_path / "out" / "walk"
+    assert record["directory"] == str(mission) and all((mission / name).is_file() for name in RESULTS)
+    assert not [path for path in mission.iterdir() if path.name.startswith(".")]
+    assert hash_file(log) == before
+
+
+def test_side_file_opens_with_checksums_and_agrees_with_its_statistics(log, tmp_path, capsys):
+    run(capsys, log, tmp_path / "out", *BANK)
+    with (tmp_path / "out" / "walk" / "walk.cadence.mcap").open("rb") as file:
+        reader = make_reader(file, validate_crcs=True)
+        summary = reader.get_summary()
+        counts = Counter(channel.topic for _, channel, _ in reader.iter_messages())
+        metadata = {record.name: record.metadata for record in reader.iter_metadata()}
+    stated = {summary.channels[number].topic: count for number, count in summary.statistics.channel_message_counts.items()}
+    assert dict(counts) == {topic: count for topic, count in stated.items() if count}
+    assert counts["/cadence/hypotheses"] > 0 and counts["/cadence/scene"] > 0 and "cadence" in metadata
+
+
+def test_second_run_does_nothing_and_a_changed_setting_redoes_what_depends_on_it(log, tmp_path, capsys):
+    run(capsys, log, tmp_path / "out", *BANK)
+    (again,) = run(capsys, log, tmp_path / "out", *BANK)
+    assert {stage["status"] for stage in again["stages"]} == {"skipped"}
+    (changed,) = run(capsys, log, tmp_path / "out", *BANK, "--set", "infer.num_hypotheses=6")
+    assert [stage["status"] for stage in changed["stages"]] == ["skipped", "skipped", "done", "done", "done"]
+
+
+def test_same_seed_same_bytes_other_seed_other_hypotheses(log, tmp_path, capsys):
+    for name, seed in (("a", 3), ("b", 3), ("c", 4)):
+        run(capsys, log, tmp_path / name, *BANK, "--seed", str(seed))
+    files = (*TABLES, "walk.cadence.mcap", "report.html")
+    a, b, c = ({name: hash_file(tmp_path / out / "walk" / name) for name in files} for out in "abc")
+    assert a == b
+    assert a["hypotheses.parquet"] != c["hypotheses.parquet"] and a["detections.parquet"] == c["detections.parquet"]
+
+
+def test_stages_one_by_one_give_what_run_gives(log, tmp_path, capsys):
+    run(capsys, log, tmp_path / "run", *BANK)
+    mission = str(tmp_path / "single" / "walk")
+    settings = ["--quiet", *SMALL[:4], *BANK]
+    assert cli.main(["ingest", str(log), "--out", str(tmp_path / "single"), "-q"]) == 0
+    for command in ("extract", "infer", "export", "report"):
+        assert cli.main([command, mission, *settings]) == 0
+    for name in RESULTS:
+        assert hash_file(Path(mission) / name) == hash_file(tmp_path / "run" / "walk" / name), name
+
+
+@pytest.mark.skipif(not SHIPPED, reason="this checkout holds no trained checkpoint")
+def test_shipped_checkpoint_is_the_default(log, tmp_path, capsys):
+    (record,) = run(capsys, log, tmp_path / "out")
+    summary = next(stage["summary"] for stage in record["stages"] if stage["stage"] == "infer")
+    assert summary["checkpoint_sha256"] and summary["checkpoint"] in {path.stem for path in SHIPPED}
+
+
+def test_simulated_mission_can_be_scored(tmp_path, capsys):
+    simulate = ["simulate", "--out", str(tmp_path / "logs"), "--seed", "5", "--set", "simulate.duration_s=1200"]
+    assert cli.main([*simulate, "--set", "simulate.detection_rate=0.3", "--json", "-q"]) == 0
+    (log,) = json.loads(capsys.readouterr().out)["outputs"]
+    run(capsys, Path(log), tmp_path / "out", *BANK, "--set", "infer.guidance.mode=none", "--set", "infer.grid.step_s=10")
+    assert cli.main(["evaluate", str(tmp_path / "out" / Path(log).stem), "-q", "--set", "evaluate.num_resamples=20"]) == 0
+    assert "cadence" in capsys.readouterr().out
+    assert (tmp_path / "out" / Path(log).stem / "scores.md").read_text().startswith("# Scores")
