@@ -15,14 +15,8 @@ ROOT = Path(__file__).resolve().parents[1]
 SHIPPED = sorted((ROOT / "cadence" / "checkpoints").glob("*.safetensors"))
 SMALL = ["--set", "infer.num_hypotheses=5", "--set", "infer.grid.stride_steps=32", "--json", "--quiet"]
 BANK = ["--set", "infer.checkpoint=none"]
-RESULTS = (
-    "detections.parquet",
-    "hypotheses.parquet",
-    "windows.parquet",
-    "walk.cadence.mcap",
-    "walk.layout.json",
-    "report.html",
-)
+TABLES = ("detections.parquet", "hypotheses.parquet", "windows.parquet")
+RESULTS = (*TABLES, "walk.cadence.mcap", "walk.layout.json", "report.html")
 
 
 def run(capsys, log: Path, out: Path, *more: str) -> list[dict]:
