@@ -23,6 +23,7 @@ from pipeline.config import config_as_dict
 from pipeline.manifest import StageResult, write_atomic
 from pipeline.progress import Progress
 from pipeline.shards import synthetic_shard
+from pipeline.train_absolute import AbsoluteTraining, train_absolute
 
 _VALIDATION_SEED_OFFSET = 500_009
 _STEPS_A_SHARD = 120
@@ -41,6 +42,8 @@ class TrainConfig:
     num_validation_shards  shards from other scenarios, never trained on
     validate_every, save_every  steps
     threads           of torch; None = as many as there are cores
+    network, windows  of the general preset
+    paper             of the paper preset
     """
 
     preset: Literal["general", "paper"] = "general"
@@ -55,6 +58,7 @@ class TrainConfig:
     network: ResidualNetworkConfig = field(default_factory=ResidualNetworkConfig)
     windows: SyntheticConfig = field(default_factory=SyntheticConfig)
     optimiser: OptimiserConfig = field(default_factory=OptimiserConfig)
+    paper: AbsoluteTraining = field(default_factory=AbsoluteTraining)
 
 
 def train(out: Path, config: TrainConfig, progress: Progress, force: bool = False) -> StageResult:
@@ -65,8 +69,6 @@ def train(out: Path, config: TrainConfig, progress: Progress, force: bool = Fals
     if config.threads is not None:
         torch.set_num_threads(config.threads)
     if config.preset == "paper":
-        from pipeline.train_absolute import train_absolute
-
         return train_absolute(out, config, progress, force)
     torch.manual_seed(config.seed)
     trainer = Trainer(ResidualNetwork(config.network), config.optimiser)
@@ -145,7 +147,7 @@ def _validation_loss(trainer: Trainer, windows: ResidualWindows) -> float:
 
 
 def _state_key(config: TrainConfig) -> str:
-    return repr(sorted(config_as_dict(config).items()))
+    return repr(sorted(item for item in config_as_dict(config).items() if item[0] != "paper"))
 
 
 def _resume(out: Path, config: TrainConfig, trainer: Trainer, force: bool) -> list[tuple[int, float, float]]:

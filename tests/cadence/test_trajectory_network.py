@@ -94,9 +94,8 @@ def test_goal_and_elapsed_are_inputs_where_asked_for():
 
 
 def test_bias_alone_and_bad_sizes():
-    film, bias = (
-        sum(p.numel() for p in TrajectoryNetwork(dataclasses.replace(SMALL, conditioning=c)).parameters()) for c in ("film", "bias")
-    )
+    networks = [TrajectoryNetwork(dataclasses.replace(SMALL, conditioning=kind)) for kind in ("film", "bias")]
+    film, bias = (sum(parameter.numel() for parameter in network.parameters()) for network in networks)
     assert bias < film
     with pytest.raises(ValueError, match="multiple of 2"):
         dataclasses.replace(SMALL, num_steps=15)
