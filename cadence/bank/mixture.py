@@ -114,7 +114,10 @@ def random_numbers(weight: Tensor, rows: Nodes, seeds: Tensor, num_hypotheses: i
         last_used = int((weight[row] > 0).sum()) - 1
         owner[row] = torch.searchsorted(weight[row].cumsum(0).clamp(max=1.0), points).clamp(max=last_used)
         used = num_steps + num_detections[row]
-        normal[row, :, :used] = torch.randn(k, used, 4, generator=generator, dtype=torch.float64)
+        drawn = torch.randn(k, used, 4, generator=generator, dtype=torch.float64)
+        normal[row, :, : used - 1] = drawn[:, :-1]
+        # samples are drawn backwards from the last node, which may be padding: its numbers are the ones that spread the end
+        normal[row, :, -1] = drawn[:, -1]
         uniform[row] = torch.rand(k, num_steps, 2, generator=generator, dtype=torch.float64)
         kick[row] = torch.randn(k, num_steps, 4, generator=generator, dtype=torch.float64)
     return Numbers(owner, normal, uniform, kick)
