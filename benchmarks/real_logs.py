@@ -132,7 +132,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     print(as_text(rows))
     if options.publish is not None:
         options.publish.mkdir(parents=True, exist_ok=True)
-        command = " ".join(["python benchmarks/real_logs.py", *(arguments if arguments is not None else sys.argv[1:])])
+        command = " ".join(["python benchmarks/real_logs.py", *(sys.argv[1:] if arguments is None else arguments)])
+        command = command.replace(f" --work {options.work}", "").replace(" --quiet", "")  # these change no number
         write_atomic(options.publish / "real_logs.md", as_markdown(rows, found, command))
         draw_chart(rows, options.publish / "real_logs.png")
     return 0
@@ -346,13 +347,17 @@ def draw_chart(rows: Sequence[Row], path: Path) -> None:
                 axis.errorbar(x, y, np.maximum(reach, 0.0), fmt="o", color=f"C{index}", label=name, capsize=2)
             axis.axhline(1.0, color="0.6", linewidth=1)
             axis.set_yscale("log")
-            ticks = [0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 5.0]
+            axis.set_ylim(0.25, 4.0)
+            ticks = [0.3, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0]
             axis.set_yticks(ticks, [f"{tick:g}" for tick in ticks])
             axis.minorticks_off()
             axis.set_xticks(range(len(rates)), [f"{100 * rate:.0f} %" for rate in rates])
             axis.set_title(f"{log}, {part}", fontsize=10)
-    axes[0, 0].legend(fontsize=8)
-    figure.supylabel("energy score over that of the better Kalman smoother")
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=len(names), fontsize=9)
+    figure.suptitle(
+        "Energy score over that of the better Kalman smoother (below 1 is better; beyond 4 is not shown)", fontsize=11
+    )
     figure.savefig(path, dpi=110)
     plt.close(figure)
 
