@@ -1,7 +1,7 @@
 """All stages for many logs: one bad log never stops the others, and what is done already is skipped."""
 
 import traceback
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -62,7 +62,7 @@ def exit_code(results: Sequence[LogResult]) -> int:
 
 
 def _run_log(log: Path, directory: Path, config: RunConfig, progress: Progress, force: bool) -> LogResult:
-    steps = (
+    steps: tuple[tuple[str, Callable[[], StageResult]], ...] = (
         ("ingest", lambda: ingest(log, directory, config.ingest, progress, force)),
         ("extract", lambda: extract(directory, config.extract, progress, force)),
         ("infer", lambda: infer(directory, config.infer, progress, force)),

@@ -26,6 +26,9 @@ class TrajectoryNetworkConfig:
     num_levels      sampling steps of the cosine schedule it is trained on
     prediction      what it answers
     conditioning    FiLM (the paper's text) or a bias alone (the authors' code)
+    width, multipliers, num_blocks  channels of the first level, multiples on each level, residual blocks a level
+    kernel_size, num_groups         of the convolutions, and of the group normalisation
+    activation, pre_norm            nonlinearity; normalise before instead of after the convolution
     encoder_size    state of the detections' LSTM
     level_size      embedding of the noise level
     max_detections  the last detections that the encoder reads
