@@ -103,10 +103,9 @@ class AbsoluteTraining:
 def train_absolute(out: Path, config: "TrainConfig", progress: Progress, force: bool = False) -> StageResult:
     """Train the paper's preset into `out`; see `pipeline.train.train`. `config.data` None means the simulator."""
     source = _LogSource(out, config, progress) if config.data is not None else _PatrolSource(config)
-    generator_state = torch.random.get_rng_state()
-    torch.random.default_generator.manual_seed(config.seed)
-    trainer = Trainer(TrajectoryNetwork(config.paper.network), config.optimiser)
-    torch.random.set_rng_state(generator_state)
+    with torch.random.fork_rng(devices=[]):  # layers take their first weights from the global stream, which is left as it was
+        torch.random.manual_seed(config.seed)
+        trainer = Trainer(TrajectoryNetwork(config.paper.network), config.optimiser)
     schedule = config.paper.network.schedule()
 
     def loss_at(step: int) -> Loss:
@@ -168,9 +167,10 @@ class _PatrolSource:
     def batch(self, step: int, size: int, generator: torch.Generator) -> AbsoluteWindows:
         num = min(self.config.paper.num_episodes, _FIRST_EPISODES + step // _STEPS_AN_EPISODE)
         pick = torch.randint(num, (size,), generator=generator)
+        counts = torch.bincount(pick, minlength=num).tolist()
         parts = []
-        for index, count in zip(*(value.tolist() for value in pick.unique(return_counts=True)), strict=True):
-            windows = self._episode(index)
+        for index, count in enumerate(counts):
+            windows = self._episode(index) if count else self.validation[:0]
             if len(windows):
                 parts.append(windows[torch.randint(len(windows), (count,), generator=generator)])
         # episodes in which nothing was seen leave gaps; none at all is next to impossible
@@ -187,31 +187,42 @@ class _PatrolSource:
         return mission_windows(mission, self.config.paper, self.model, seed * 1_000_003 + index)
 
 
-def mission_windows(mission: TrainingMission, training: AbsoluteTraining, model: AbsoluteConfig, seed: int) -> AbsoluteWindows:
-    """`num_windows` windows at random steps of a mission, those of its agents that were detected before; maybe none.
+@dataclass(frozen=True, eq=False)
+class KnownWindows:
+    """Windows with truth_m [B, A, T, 2] relative to their datum, is_known [B, A, T], elapsed [B]."""
 
-    Origins lie whole steps after the first truth sample, anywhere up to the last.
-    """
+    windows: MissionWindows
+    truth_m: Tensor
+    is_known: Tensor
+    elapsed: Tensor
+
+
+def draw_windows(mission: TrainingMission, training: AbsoluteTraining, model: AbsoluteConfig, seed: int) -> KnownWindows:
+    """`num_windows` windows of a mission with at least one detection, at random whole steps after its first truth sample."""
     step_ns = round(model.step_s * 1e9)
     times = mission.truth["time_ns"].to_numpy()
     rng = np.random.default_rng([seed, 2])
     num_steps = max(1, int(times.max() - times.min()) // step_ns + 1)
     origins = times.min() + step_ns * np.sort(rng.integers(0, num_steps, training.num_windows))
     grid = Grid(step_ns, model.history_steps, model.horizon_steps, origins, training.context_steps)
-    if mission.detections.num_rows == 0:
-        return _no_windows(model)
     windows = build_windows(mission.detections, grid, seed)
     truth_m, is_known = truth_on_grid(mission.truth, windows, training.max_gap_steps * model.step_s)
     if training.parked_tail:
         truth_m, is_known = _parked(mission, windows, truth_m, is_known)
-    elapsed = (origins - times.min()) / step_ns / model.age_scale_steps
-    return _normalised(windows, _filled(truth_m, is_known), is_known, torch.from_numpy(elapsed), model)
+    elapsed = torch.from_numpy((origins - times.min()) / step_ns / model.age_scale_steps)
+    return KnownWindows(windows, _filled(truth_m, is_known), is_known, elapsed)
 
 
-def _normalised(
-    windows: MissionWindows, truth_m: Tensor, is_known: Tensor, elapsed: Tensor, model: AbsoluteConfig
-) -> AbsoluteWindows:
+def mission_windows(mission: TrainingMission, training: AbsoluteTraining, model: AbsoluteConfig, seed: int) -> AbsoluteWindows:
+    """Training windows of a mission: those of its agents that were detected before the window's origin; maybe none."""
+    if mission.detections.num_rows == 0:
+        return _no_windows(model)
+    return _normalised(draw_windows(mission, training, model, seed), model)
+
+
+def _normalised(known: KnownWindows, model: AbsoluteConfig) -> AbsoluteWindows:
     """Active agents as rows, in the network's units; rows without any known step are left out."""
+    windows, is_known = known.windows, known.is_known
     nodes, _ = active_rows(windows.batch)
     window, agent = windows.batch.is_active.nonzero(as_tuple=True)
     centre = torch.tensor(model.centre_m, dtype=torch.float64) - torch.from_numpy(windows.datum_m)[window]
@@ -220,8 +231,8 @@ def _normalised(
     age = -nodes.time_s / model.step_s / model.age_scale_steps
     place = (nodes.position_m - centre[:, None]) / model.scale_m
     rows, is_observed = detection_rows(age, place, nodes.is_observed, model.network.max_detections)
-    clean = ((truth_m[window, agent] - centre[:, None]) / model.scale_m).float()
-    extra = elapsed[window, None].float() if model.network.elapsed else None
+    clean = ((known.truth_m[window, agent] - centre[:, None]) / model.scale_m).float()
+    extra = known.elapsed[window, None].float() if model.network.elapsed else None
     found = AbsoluteWindows(clean, is_known[window, agent], rows, is_observed, extra)
     return found[is_known[window, agent].any(dim=-1).nonzero()[:, 0]]
 
@@ -272,7 +283,5 @@ def _map_limits(training: AbsoluteTraining, missions: list[TrainingMission]) -> 
 def _joined(parts: list[AbsoluteWindows], data: Path) -> AbsoluteWindows:
     windows = join_absolute(parts)
     if len(windows) == 0:
-        raise InputError(
-            f"{data}: no window of these logs has both a detection and truth; check that agents are named alike"
-        )
+        raise InputError(f"{data}: no window of these logs has both a detection and truth; check that agents are named alike")
     return windows
