@@ -17,6 +17,7 @@ from cadence.bank.hindsight import choose_by_hindsight
 from cadence.bank.rows import active_rows
 from cadence.constraints.obstacles import Obstacles
 from cadence.diffusion.feasible import Feasibility, resampled
+from cadence.diffusion.gate import NO_GATE, GateScores, gated
 from cadence.diffusion.general import GeneralModel
 from cadence.errors import ConfigError, DeviceError
 from cadence.network.residual import ResidualNetwork, ResidualNetworkConfig
@@ -70,6 +71,7 @@ class InferConfig:
     num_steps        evaluations of the network a hypothesis
     default_sigma_m  accuracy of detections that state none
     device           "auto", "cpu" or "cuda"
+    is_gated         the network takes part only where, on this log, it foresees withheld detections no worse than the bank
     """
 
     num_hypotheses: int = 30
@@ -79,6 +81,7 @@ class InferConfig:
     num_steps: int = 6
     default_sigma_m: float = 0.0
     device: str = "auto"
+    is_gated: bool = True
     grid: GridConfig = field(default_factory=GridConfig)
     guidance: GuidanceConfig = field(default_factory=GuidanceConfig)
 
@@ -101,7 +104,7 @@ def infer(directory: Path, config: InferConfig, progress: Progress, force: bool 
         obstacles = read_obstacles(directory / "obstacles.json")
         grid = plan_grid(detections, config.grid)
         windows = build_windows(detections, grid, config.seed, config.default_sigma_m)
-        model = fitted_model(config, detections, grid, windows, weights)
+        model, gate = fitted_model(config, detections, grid, windows, weights)
         log_id = str(detections["log_id"][0])
         parts, statuses = [], []
         with progress.bar(windows.batch.num_windows, "infer", unit="window") as bar:
@@ -123,7 +126,7 @@ def infer(directory: Path, config: InferConfig, progress: Progress, force: bool 
             "checkpoint": config.checkpoint,
             "checkpoint_sha256": None if weights is None else checkpoint_hash(weights),
             "seed": config.seed,
-            **_model_summary(model),
+            **_model_summary(model, gate),
         }
 
     return run_stage("infer", directory, config=config, inputs=inputs, body=body, force=force)
@@ -145,11 +148,12 @@ def load_model(config: InferConfig, weights: Path | None) -> GeneralModel:
 
 def fitted_model(
     config: InferConfig, detections: pa.Table, grid: Grid, windows: MissionWindows, weights: Path | None
-) -> GeneralModel:
-    """The model with its bank fitted to the log's detections, the settings of the bank chosen by hindsight."""
-    model = load_model(config, weights)
-    bank = fitted_bank(fit_tracks(detections, grid, config.default_sigma_m), detections, grid, windows, config.default_sigma_m)
-    return dataclasses.replace(model, bank=bank)
+) -> tuple[GeneralModel, GateScores]:
+    """The model fitted to the log's detections; settings of the bank and the network's part in it chosen by hindsight."""
+    sigma_m = config.default_sigma_m
+    bank = fitted_bank(fit_tracks(detections, grid, sigma_m), detections, grid, windows, sigma_m)
+    model = dataclasses.replace(load_model(config, weights), bank=bank)
+    return gated(model, *_hindsight_windows(detections, grid, windows, sigma_m)) if config.is_gated else (model, NO_GATE)
 
 
 def fitted_bank(
@@ -157,15 +161,20 @@ def fitted_bank(
 ) -> Bank:
     """The bank fitted to a log: weights by likelihood, the choice among its settings by hindsight on later detections."""
     bank = Bank().fit(tracks, grid.step_s)
+    some, later = _hindsight_windows(detections, grid, windows, default_sigma_m)
+    return choose_by_hindsight(bank, some, later)
+
+
+def _hindsight_windows(
+    detections: pa.Table, grid: Grid, windows: MissionWindows, default_sigma_m: float
+) -> tuple[WindowBatch, Detections]:
+    """Evenly spread windows in which something was detected before the origin and after it, and what was after it."""
     later = later_detections(detections, grid, windows, default_sigma_m)
-    # evenly spread windows in which something is known before the origin and after it
     useful = (windows.batch.is_active & later.is_observed.any(-1)).sum(1)
     order = torch.nonzero(useful)[:, 0]
-    if len(order) == 0:
-        return bank
-    num = max(1, int(_HINDSIGHT_ROWS / float(useful[order].double().mean())))
+    num = max(1, int(_HINDSIGHT_ROWS / float(useful[order].double().mean()))) if len(order) else 0
     chosen = order[torch.linspace(0, len(order) - 1, min(num, len(order))).round().long()]
-    return choose_by_hindsight(bank, windows.batch[chosen], later[chosen])
+    return windows.batch[chosen], later[chosen]
 
 
 def draw_hypotheses(
@@ -273,11 +282,12 @@ def _window_rows(windows: MissionWindows, part: Tensor, position: Tensor, weight
     return pa.Table.from_pylist(rows, schema=WINDOWS)
 
 
-def _model_summary(model: GeneralModel) -> dict[str, Any]:
+def _model_summary(model: GeneralModel, gate: GateScores) -> dict[str, Any]:
     bank = model.bank
     return {
         "sampler": model.sampler,
         "num_steps": model.num_steps if model.network is not None else 0,
+        "gate": {**dataclasses.asdict(gate), "past": model.strength_past > 0, "future": model.strength_future > 0},
         "bank": {"speed_mps": bank.speed_mps, "switch_rate": bank.switch_rate, "num_models": len(bank.models)},
     }
 

@@ -1,7 +1,7 @@
-"""Choice among settings of the bank by hindsight: how well each foresees detections that came later.
+"""Choices by hindsight: how well each candidate foresees, or fills in, detections that it was not shown.
 
-The likelihood that weighs the models is ruled by short steps within bursts; what counts for a forecast is the motion
-across gaps. Detections after a window's origin tell, without any truth.
+The likelihood that weighs the models is ruled by short steps within bursts; what counts is the motion across gaps.
+Detections after a window's origin, and bursts withheld inside it, tell — without any truth.
 """
 
 import dataclasses
@@ -10,9 +10,11 @@ import torch
 from torch import Tensor
 
 from cadence.bank.bank import Bank
-from cadence.types import Detections, WindowBatch
+from cadence.types import Detections, Estimator, WindowBatch
 
-_NUM_SAMPLES = 24
+NUM_SAMPLES = 24
+_WITHHELD_STEPS = 1.5
+_LEAST_TESTS = 8
 
 
 def candidates(bank: Bank) -> tuple[Bank, ...]:
@@ -27,30 +29,65 @@ def candidates(bank: Bank) -> tuple[Bank, ...]:
 
 
 def choose_by_hindsight(bank: Bank, windows: WindowBatch, later: Detections) -> Bank:
-    """The candidate with the least mean energy score at the detections `later` [B, A, N] after each window's origin.
+    """The candidate with the least `hindsight_score` at the detections `later` [B, A, N] after each window's origin.
 
-    Errors are divided by the distance at typical speed since the last detection, so that long gaps do not rule alone.
-    Without any later detection the bank stays as it is.
+    Without enough of them the bank stays as it is.
     """
-    is_used = later.is_observed & windows.is_active[..., None] & (later.time_s <= windows.time_s[-1])
-    if int(is_used.sum()) < 8 or bank.log_weight is None:
+    if windows.num_windows == 0 or num_tests(windows, later) < _LEAST_TESTS or bank.log_weight is None:
         return bank
-    scores = [_score(candidate, windows, later, is_used) for candidate in candidates(bank)]
-    return candidates(bank)[int(torch.stack(scores).argmin())]
+    scores = [hindsight_score(candidate, windows, later) for candidate in candidates(bank)]
+    return candidates(bank)[scores.index(min(scores))]
 
 
-def _score(bank: Bank, windows: WindowBatch, later: Detections, is_used: Tensor) -> Tensor:
-    position = bank.sample(windows, _NUM_SAMPLES).position_m.nan_to_num()
-    at = ((later.time_s - windows.time_s[0]) / windows.step_s).clamp(0, windows.num_steps - 1.001)
+def num_tests(windows: WindowBatch, shown_later: Detections) -> int:
+    """How many detections can be compared."""
+    return int(_is_used(windows, shown_later).sum())
+
+
+def hindsight_score(estimator: Estimator, windows: WindowBatch, shown_later: Detections) -> float:
+    """Mean energy score at detections [B, A, N] that `windows` do not hold, anywhere on their grid.
+
+    Errors are divided by the time to the nearest detection in the window, so that long gaps do not rule alone.
+    """
+    is_used = _is_used(windows, shown_later)
+    position = estimator.sample(windows, NUM_SAMPLES).position_m.nan_to_num()
+    at = ((shown_later.time_s - windows.time_s[0]) / windows.step_s).clamp(0, windows.num_steps - 1.001)
     before = at.floor().long()
     share = (at - before)[:, None, :, :, None]
-    pick = before[:, None, :, :, None].expand(-1, _NUM_SAMPLES, -1, -1, 2)
+    pick = before[:, None, :, :, None].expand(-1, NUM_SAMPLES, -1, -1, 2)
     foreseen = (1.0 - share) * position.gather(3, pick) + share * position.gather(3, pick + 1)
-    error = (foreseen - later.position_m[:, None]).norm(dim=-1).mean(1)
+    error = (foreseen - shown_later.position_m[:, None]).norm(dim=-1).mean(1)
     # half of the samples against the other half: an unbiased estimate of the mean distance between two of them
-    half = _NUM_SAMPLES // 2
+    half = NUM_SAMPLES // 2
     spread = (foreseen[:, :half] - foreseen[:, half:]).norm(dim=-1).mean(1)
-    last = torch.where(windows.detections.is_observed, windows.detections.time_s, -torch.inf).amax(-1, keepdim=True)
-    scale = (later.time_s - last).clamp_min(windows.step_s)
-    score: Tensor = ((error - 0.5 * spread) / scale)[is_used].mean()
-    return score
+    distance_s = (shown_later.time_s[..., None] - windows.detections.time_s[..., None, :]).abs()
+    known = windows.detections.is_observed[..., None, :]
+    scale = torch.where(known, distance_s, torch.inf).amin(-1).clamp_min(windows.step_s)
+    return float(((error - 0.5 * spread) / scale)[is_used].mean())
+
+
+def withhold(windows: WindowBatch, seed: int) -> tuple[WindowBatch, Detections]:
+    """The windows without one burst each, chosen at random among all but the first and the last detection, and that burst."""
+    detections = windows.detections
+    generator = torch.Generator().manual_seed(seed)
+    draw = torch.rand(detections.time_s.shape, generator=generator)
+    index = torch.arange(detections.time_s.shape[2])
+    is_inner = detections.is_observed & (index > 0) & (index < detections.count[..., None] - 1)
+    chosen = torch.where(is_inner, draw, -1.0).argmax(-1, keepdim=True)
+    distance_s = (detections.time_s - detections.time_s.gather(2, chosen)).abs()
+    is_withheld = is_inner & is_inner.any(-1, keepdim=True) & (distance_s <= _WITHHELD_STEPS * windows.step_s)
+    # padding belongs last: what is kept moves to the front, in order
+    order = torch.argsort((~(detections.is_observed & ~is_withheld)).to(torch.int8), dim=-1, stable=True)
+    kept = Detections(
+        detections.time_s.gather(2, order),
+        detections.position_m.gather(2, order[..., None].expand(-1, -1, -1, 2)),
+        detections.covariance_m2.gather(2, order[..., None, None].expand(-1, -1, -1, 2, 2)),
+        (detections.is_observed & ~is_withheld).gather(2, order),
+    )
+    withheld = dataclasses.replace(detections, is_observed=is_withheld)
+    return dataclasses.replace(windows, detections=kept), withheld
+
+
+def _is_used(windows: WindowBatch, shown_later: Detections) -> Tensor:
+    is_on_grid = (shown_later.time_s <= windows.time_s[-1]) & (shown_later.time_s >= windows.time_s[0])
+    return shown_later.is_observed & windows.is_active[..., None] & is_on_grid

@@ -21,6 +21,7 @@ from cadence.types import Detections, HypothesisSet, WindowBatch
 
 _SAMPLERS = {"rotation": sample_rotation, "ddim": sample_ddim, "dpmpp": sample_dpmpp_2m}
 _MAX_BATCH = 960
+_RAMP_STEPS = 8.0
 
 CleanHook = Callable[[Tensor, Tensor, slice], Tensor]
 """(positions [R', K, T, 2] in metres, sigma [R', T], which R' of the active rows) -> positions: guidance of clean estimates."""
@@ -35,6 +36,7 @@ class GeneralModel:
     sampler    "rotation", "ddim" or "dpmpp"
     num_steps  evaluations of the network for each hypothesis
     guide      moves clean estimates, or None
+    strength_past, strength_future  factor of the network's answer up to the origin and after it: 0 leaves the bank alone
     bf16       network in bfloat16: about twice as fast where the processor knows it
     device     of the network; the bank works on the processor
     """
@@ -44,6 +46,8 @@ class GeneralModel:
     sampler: str = "rotation"
     num_steps: int = 6
     guide: CleanHook | None = None
+    strength_past: float = 1.0
+    strength_future: float = 1.0
     bf16: bool = False
     device: str = "cpu"
     name: str = "cadence"
@@ -56,7 +60,7 @@ class GeneralModel:
         """Draw hypotheses for every active agent; deterministic in the windows' seeds."""
         rows, _ = active_rows(windows)
         posterior = self.bank.posterior(windows, num_hypotheses)
-        if self.network is None or len(rows.time_s) == 0:
+        if self.network is None or len(rows.time_s) == 0 or self.strength_past == self.strength_future == 0.0:
             return scatter_hypotheses(posterior.sample_m, windows)
         length_m = self.bank.length_m(windows.step_s)
         context = build_context(posterior, rows, windows.time_s, windows.step_s, length_m)
@@ -84,11 +88,12 @@ class GeneralModel:
         wide = context.repeated(num_hypotheses)
         rows = slice(begin, begin + num_rows)
         mean, sigma = posterior.mean_m[rows, None], posterior.sigma_m[rows]
+        strength = self._strength(context)
 
         def denoise(state: Tensor, angle: float) -> Tensor:
             level = torch.full((len(state),), angle, device=state.device)
             with torch.autocast(torch.device(self.device).type, dtype=torch.bfloat16, enabled=self.bf16):
-                velocity = network(state, level, wide, code).float()
+                velocity = strength * network(state, level, wide, code).float()
             return clean_from("v", velocity, state, torch.tensor(angle))
 
         def guide(clean: Tensor, angle: float) -> Tensor:
@@ -102,3 +107,9 @@ class GeneralModel:
         start = noise.flatten(0, 1).to(self.device)
         result = _SAMPLERS[self.sampler](denoise, start, even_angles(self.num_steps), guide)
         return result.cpu().view(num_rows, num_hypotheses, -1, 2)
+
+    def _strength(self, context: ResidualContext) -> Tensor:
+        """Factor of the network's answer at every step [T, 1]; a ramp where past and future differ, so that nothing jumps."""
+        steps = torch.arange(context.is_future.shape[1], device=context.mean.device) - (~context.is_future[0]).sum() + 0.5
+        share = (0.5 + steps / _RAMP_STEPS).clamp(0.0, 1.0)
+        return (self.strength_past + share * (self.strength_future - self.strength_past))[:, None]
