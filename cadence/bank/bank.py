@@ -144,7 +144,9 @@ class Bank:
         smoothed = _smooth_rows(models, rows, choose_models(log_posterior), seeds, windows.time_s, num_hypotheses, diffuse_m)
         if self.switch_rate > 0.0:
             last_s = torch.where(rows.is_observed, rows.time_s, rows.time_s[:, :1]).amax(1)
-            self._switch_after(smoothed, models, durations_after(windows.time_s.double(), last_s), windows.step_s)
+            durations = durations_after(windows.time_s.double(), last_s)
+            if bool((durations > 0).any()):
+                self._switch_after(smoothed, models, durations, windows.step_s)
         return smoothed.mean_m, smoothed.variance_m2.sqrt(), smoothed.sample_m
 
     def _switch_after(self, smoothed: "_Smoothed", models: MotionModels, durations: Tensor, step_s: float) -> None:
@@ -152,7 +154,7 @@ class Bank:
         # only models that carry weight take part after the last detection
         taking_part, chosen_index, later = self._models_after(smoothed.chosen)
         switching = SwitchingModels(models[taking_part], later, self.switch_rate / step_s)
-        begin = int((durations > 0).any(0).to(torch.int64).argmax()) if (durations > 0).any() else durations.shape[1]
+        begin = int((durations > 0).any(0).to(torch.int64).argmax())
         durations = durations[:, begin:]
         is_after = durations > 0
         node = smoothed.last_node
