@@ -17,7 +17,7 @@ from cadence.bank.hindsight import choose_by_hindsight
 from cadence.bank.rows import active_rows
 from cadence.constraints.obstacles import Obstacles
 from cadence.diffusion.feasible import Feasibility, resampled
-from cadence.diffusion.gate import NO_GATE, GateScores, gated
+from cadence.diffusion.gate import gated
 from cadence.diffusion.general import GeneralModel
 from cadence.errors import ConfigError, DeviceError
 from cadence.network.residual import ResidualNetwork, ResidualNetworkConfig
@@ -104,7 +104,7 @@ def infer(directory: Path, config: InferConfig, progress: Progress, force: bool 
         obstacles = read_obstacles(directory / "obstacles.json")
         grid = plan_grid(detections, config.grid)
         windows = build_windows(detections, grid, config.seed, config.default_sigma_m)
-        model, gate = fitted_model(config, detections, grid, windows, weights)
+        model = fitted_model(config, detections, grid, windows, weights)
         log_id = str(detections["log_id"][0])
         parts, statuses = [], []
         with progress.bar(windows.batch.num_windows, "infer", unit="window") as bar:
@@ -126,7 +126,7 @@ def infer(directory: Path, config: InferConfig, progress: Progress, force: bool 
             "checkpoint": config.checkpoint,
             "checkpoint_sha256": None if weights is None else checkpoint_hash(weights),
             "seed": config.seed,
-            **_model_summary(model, gate),
+            **_model_summary(model),
         }
 
     return run_stage("infer", directory, config=config, inputs=inputs, body=body, force=force)
@@ -148,12 +148,12 @@ def load_model(config: InferConfig, weights: Path | None) -> GeneralModel:
 
 def fitted_model(
     config: InferConfig, detections: pa.Table, grid: Grid, windows: MissionWindows, weights: Path | None
-) -> tuple[GeneralModel, GateScores]:
+) -> GeneralModel:
     """The model fitted to the log's detections; settings of the bank and the network's part in it chosen by hindsight."""
     sigma_m = config.default_sigma_m
     bank = fitted_bank(fit_tracks(detections, grid, sigma_m), detections, grid, windows, sigma_m)
     model = dataclasses.replace(load_model(config, weights), bank=bank)
-    return gated(model, *_hindsight_windows(detections, grid, windows, sigma_m)) if config.is_gated else (model, NO_GATE)
+    return gated(model, *_hindsight_windows(detections, grid, windows, sigma_m)) if config.is_gated else model
 
 
 def fitted_bank(
@@ -282,12 +282,13 @@ def _window_rows(windows: MissionWindows, part: Tensor, position: Tensor, weight
     return pa.Table.from_pylist(rows, schema=WINDOWS)
 
 
-def _model_summary(model: GeneralModel, gate: GateScores) -> dict[str, Any]:
+def _model_summary(model: GeneralModel) -> dict[str, Any]:
     bank = model.bank
+    ratios = dataclasses.asdict(model.gate) if model.gate else {}
     return {
         "sampler": model.sampler,
         "num_steps": model.num_steps if model.network is not None else 0,
-        "gate": {**dataclasses.asdict(gate), "past": model.strength_past > 0, "future": model.strength_future > 0},
+        "network": {"in_past": model.strength_past > 0, "in_future": model.strength_future > 0, **ratios},
         "bank": {"speed_mps": bank.speed_mps, "switch_rate": bank.switch_rate, "num_models": len(bank.models)},
     }
 

@@ -3,25 +3,14 @@
 import dataclasses
 
 from cadence.bank.hindsight import hindsight_score, num_tests, withhold
-from cadence.diffusion.general import GeneralModel
+from cadence.diffusion.general import GateScores, GeneralModel
 from cadence.types import Detections, WindowBatch
 
 _LEAST_TESTS = 8
 
 
-@dataclasses.dataclass(frozen=True)
-class GateScores:
-    """Energy scores of the network over the bank's, on withheld bursts (past) and later detections (future); below one wins."""
-
-    past_ratio: float | None
-    future_ratio: float | None
-
-
-NO_GATE = GateScores(None, None)
-
-
-def gated(model: GeneralModel, windows: WindowBatch, later: Detections, seed: int = 0) -> tuple[GeneralModel, GateScores]:
-    """The model with its network switched off where it scores worse than the bank, and the ratios that decided.
+def gated(model: GeneralModel, windows: WindowBatch, later: Detections, seed: int = 0) -> GeneralModel:
+    """The model with its network switched off where it scores worse than the bank.
 
     Args:
         model: with its bank fitted.
@@ -30,11 +19,12 @@ def gated(model: GeneralModel, windows: WindowBatch, later: Detections, seed: in
         seed: of what is withheld.
     """
     if model.network is None or windows.num_windows == 0:
-        return model, NO_GATE
+        return model
     past = _ratio(model, *withhold(windows, seed))
     future = _ratio(model, windows, later)
     strength = tuple(1.0 if ratio is None or ratio <= 1.0 else 0.0 for ratio in (past, future))
-    return dataclasses.replace(model, strength_past=strength[0], strength_future=strength[1]), GateScores(past, future)
+    scores = GateScores(past, future)
+    return dataclasses.replace(model, strength_past=strength[0], strength_future=strength[1], gate=scores)
 
 
 def _ratio(model: GeneralModel, windows: WindowBatch, unseen: Detections) -> float | None:

@@ -27,6 +27,17 @@ CleanHook = Callable[[Tensor, Tensor, slice], Tensor]
 """(positions [R', K, T, 2] in metres, sigma [R', T], which R' of the active rows) -> positions: guidance of clean estimates."""
 
 
+@dataclass(frozen=True)
+class GateScores:
+    """Energy scores of the network over the bank's on detections withheld from both; below one the network wins.
+
+    past_ratio, future_ratio  None where too little could be withheld
+    """
+
+    past_ratio: float | None
+    future_ratio: float | None
+
+
 @dataclass(frozen=True, eq=False)
 class GeneralModel:
     """Bank and residual network; `sample` draws joint hypotheses of past and future.
@@ -39,6 +50,7 @@ class GeneralModel:
     strength_past, strength_future  factor of the network's answer up to the origin and after it: 0 leaves the bank alone
     bf16       network in bfloat16: about twice as fast where the processor knows it
     device     of the network; the bank works on the processor
+    gate       what decided the strengths, or None
     """
 
     bank: Bank
@@ -50,6 +62,7 @@ class GeneralModel:
     strength_future: float = 1.0
     bf16: bool = False
     device: str = "cpu"
+    gate: GateScores | None = None
     name: str = "cadence"
 
     def fit(self, tracks: Detections, step_s: float | None = None) -> "GeneralModel":
