@@ -69,13 +69,15 @@ CASES = {
 }
 
 
-def _model(data: FittingData, checkpoint: str) -> Estimator:
-    config = InferConfig(checkpoint=checkpoint)
-    return fitted_model(config, data.detections, data.grid, data.windows, find_checkpoint(checkpoint))
+def _model(data: FittingData, checkpoint: str, is_gated: bool) -> Estimator:
+    config = InferConfig(checkpoint=checkpoint, is_gated=is_gated)
+    return fitted_model(config, data.detections, data.grid, data.windows, find_checkpoint(checkpoint))[0]
 
 
 OWN = "cadence"
-ESTIMATORS = (OWN, *RIVALS)
+UNGATED = "network"
+"""Cadence without its gate: the network takes part whatever hindsight says of it."""
+ESTIMATORS = (OWN, UNGATED, *RIVALS)
 
 
 @dataclass(frozen=True)
@@ -157,7 +159,7 @@ def run_setting(setting: Setting, options: argparse.Namespace, progress: Progres
     data = FittingData.of(detections, grid, windows)
     for name in missing:
         begin = time.perf_counter()
-        estimator = RIVALS[name](data) if name in RIVALS else _model(data, options.checkpoint)
+        estimator = RIVALS[name](data) if name in RIVALS else _model(data, options.checkpoint, name == OWN)
         fitted = time.perf_counter()
         with progress.bar(windows.batch.num_windows, f"{setting.folder} {name}", "window") as bar:
             cells = compare({name: estimator}, windows.batch, truth_m, is_known, num_hypotheses, None, bar.update)[name]
@@ -404,7 +406,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--logs", nargs="+", choices=CASES, default=list(CASES))
     parser.add_argument("--rates", nargs="+", type=float, default=list(RATES))
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
-    parser.add_argument("--estimators", nargs="+", choices=ESTIMATORS, default=list(ESTIMATORS))
+    parser.add_argument("--estimators", nargs="+", choices=ESTIMATORS, default=[OWN, *RIVALS])
     parser.add_argument("--again", nargs="+", choices=ESTIMATORS, default=[], help="do these again though they have results")
     parser.add_argument("--checkpoint", default=DEFAULT, help="of cadence: a file or a shipped name (default %(default)s)")
     parser.add_argument("--hypotheses", type=int, default=30, help="joint samples a window (default %(default)s)")
