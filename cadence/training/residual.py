@@ -3,7 +3,7 @@
 import math
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from cadence.diffusion.residual import RESIDUAL_CLAMP, ResidualContext, rotate
 from cadence.diffusion.schedule import MAX_ANGLE, target_of
@@ -11,11 +11,13 @@ from cadence.network.residual import ResidualNetwork
 from cadence.training.synthetic import ResidualWindows
 
 
-def residual_loss(network: ResidualNetwork, windows: ResidualWindows, generator: torch.Generator) -> Tensor:
+def residual_loss(network: nn.Module, windows: ResidualWindows, generator: torch.Generator) -> Tensor:
     """Mean square error of the velocity at a random noise level for each window, mirrored and turned at random.
 
     An untrained network (zero) scores the mean square of the velocity itself, about one where the bank is calibrated.
     """
+    if not isinstance(network, ResidualNetwork):
+        raise TypeError(f"residual_loss: got a {type(network).__name__}, this is the loss of a ResidualNetwork")
     num_rows, num_samples = windows.sample.shape[:2]
     pick = torch.randint(num_samples, (num_rows,), generator=generator)
     angle = torch.rand(num_rows, generator=generator) * MAX_ANGLE
