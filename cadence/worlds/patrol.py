@@ -36,8 +36,13 @@ _RATES = (0.027, 0.047, 0.076, 0.103, 0.139, 0.187, 0.263, 0.406)
 class PatrolConfig:
     """Settings of the world.
 
-    detection_rate is the mean share of steps with a detection of an agent, over episodes; single episodes differ widely.
-    It sets the sensors' ranges, nothing is thinned out afterwards.
+    num_agents      smugglers
+    duration_s, step_s  length of an episode, and time between its steps
+    detection_rate  mean share of steps with a detection of an agent, over episodes; single episodes differ widely. It sets
+                    the sensors' ranges, nothing is thinned out afterwards
+    line_of_sight   whether land hides agents from the sensors at sea level
+    side_m          side of the map
+    num_boats, num_aircraft, num_masts  sensors of each kind
     """
 
     num_agents: int = 1
