@@ -37,10 +37,10 @@ def with_floor(rows: Nodes, floor_m: float) -> Nodes:
     return Nodes(rows.time_s, rows.position_m, rows.covariance_m2 + floor, rows.is_observed)
 
 
-def fit_ornstein_uhlenbeck(rows: Nodes, step_s: float, speed_mps: float) -> MotionModels:
-    """The integrated Ornstein-Uhlenbeck model [1] of greatest likelihood over all rows, by a search on two nested grids."""
+def fit_ornstein_uhlenbeck(rows: Nodes, step_s: float, speed_mps: float, num_grids: int = 2) -> MotionModels:
+    """The integrated Ornstein-Uhlenbeck model [1] of greatest likelihood over all rows, by a search on nested grids."""
     times, speeds = _geometric(0.2, 300.0, 10), _geometric(0.02, 8.0, 10)
-    for _ in range(2):
+    for _ in range(num_grids):
         grid = ornstein_uhlenbeck(times, speeds, [0.0])
         best = int(log_likelihood(grid, rows, step_s, speed_mps).sum(0).argmax())
         row, column = divmod(best, len(speeds))
@@ -48,10 +48,10 @@ def fit_ornstein_uhlenbeck(rows: Nodes, step_s: float, speed_mps: float) -> Moti
     return grid[torch.tensor([best])]
 
 
-def fit_constant_velocity(rows: Nodes, step_s: float, speed_mps: float) -> MotionModels:
-    """The constant-velocity model [1] of greatest likelihood over all rows."""
+def fit_constant_velocity(rows: Nodes, step_s: float, speed_mps: float, num_grids: int = 2) -> MotionModels:
+    """The constant-velocity model [1] of greatest likelihood over all rows, by a search on nested grids."""
     diffusion = _geometric(1e-6, 10.0, 15)
-    for _ in range(2):
+    for _ in range(num_grids):
         grid = constant_velocity(diffusion)
         best = int(log_likelihood(grid, rows, step_s, speed_mps).sum(0).argmax())
         diffusion = _around(diffusion, best)

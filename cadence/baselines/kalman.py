@@ -15,18 +15,23 @@ from cadence.bank.rows import track_rows
 from cadence.bank.smoother import Nodes
 from cadence.types import Detections, HypothesisSet, WindowBatch
 
+_NUM_GRIDS = 4
+"""A rival gets its optimum to a few per cent in every parameter; the bank, which mixes models, is content with a third."""
+
 
 def _single(model: MotionModels) -> Bank:
     return Bank(models=model, switch_rate=0.0, temper=1.0)
 
 
-def _fitted(bank: Bank, tracks: Detections, step_s: float | None, fit: Callable[[Nodes, float, float], MotionModels]) -> Bank:
+def _fitted(
+    bank: Bank, tracks: Detections, step_s: float | None, fit: Callable[[Nodes, float, float, int], MotionModels]
+) -> Bank:
     """The bank with the log's speed unit and its one model fitted to stretches of at least two detections, if there are any."""
     rows = track_rows(tracks)
     step_s = step_s or default_step(rows)
     speed_mps = typical_speed(rows, step_s)
     rows = rows[rows.is_observed.sum(-1) > 1]
-    models = fit(rows, step_s, speed_mps) if len(rows.time_s) else bank.models
+    models = fit(rows, step_s, speed_mps, _NUM_GRIDS) if len(rows.time_s) else bank.models
     return dataclasses.replace(bank, models=models, speed_mps=speed_mps)
 
 
