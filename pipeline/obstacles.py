@@ -5,6 +5,7 @@ obstacles.json holds {"version": 1, "obstacles": [...]}; an obstacle is {"kind":
 """
 
 import json
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,7 +28,7 @@ from pipeline.grids import (
     ros_grid,
 )
 from pipeline.logs.decode import UndecodableChannel, UndecodableMessage, decoder_for
-from pipeline.logs.reader import Channel, MissionLog, RawMessage
+from pipeline.logs.reader import MissionLog
 from pipeline.tables import Frame
 
 VERSION = 1
@@ -297,31 +298,24 @@ def _moved(entry: Json, old: Frame, new: Frame) -> Json:
 
 
 def _from_grids(log: MissionLog, sources: ObstacleSources, frame: Frame, note: Note) -> list[Json]:
-    known = {channel.topic for channel in log.channels}
+    grids = {channel.topic: channel for channel in log.channels if channel.schema_name in ROS_GRIDS + FOXGLOVE_GRIDS}
     for topic in sources.topics:
-        if topic not in known:
-            raise ConfigError(f"obstacles.topics: {topic!r} is not in {log.path}; `cadence info` lists its channels")
-    found: list[Json] = []
-    for channel in log.channels:
-        is_grid = channel.schema_name in ROS_GRIDS + FOXGLOVE_GRIDS
-        if channel.topic in sources.topics and not is_grid:
-            raise ConfigError(
-                f"obstacles.topics: {channel.topic!r} is a {channel.schema_name or 'channel without schema'}, "
-                "not nav_msgs/OccupancyGrid or foxglove.Grid"
-            )
-        # Our own output is a grid too (where targets may be), and may be part of a log that is run again.
-        if is_grid and (channel.topic in sources.topics or not (sources.topics or channel.topic.startswith("/cadence"))):
-            found += _from_grid(log, channel, sources, frame, note)
-    return found
+        if topic not in grids:
+            kind = next((channel.schema_name for channel in log.channels if channel.topic == topic), None)
+            what = "is not in the log" if kind is None else f"is a {kind or 'channel without schema'}, no occupancy grid"
+            raise ConfigError(f"obstacles.topics: {topic!r} {what}; `cadence info {log.path}` lists its channels")
+    # Our own output is a grid too (where targets may be), and may be part of a log that is run again.
+    topics = sources.topics or [topic for topic in grids if not topic.startswith("/cadence")]
+    return [entry for topic in topics for entry in _from_grid(log, topic, sources, frame, note)]
 
 
-def _from_grid(log: MissionLog, channel: Channel, sources: ObstacleSources, frame: Frame, note: Note) -> list[Json]:
-    is_stated = channel.topic in sources.topics
-    last: RawMessage | None = None
-    for message in log.messages([channel.topic]):
-        last = message if message.channel.id == channel.id else last
-    if last is None:
+def _from_grid(log: MissionLog, topic: str, sources: ObstacleSources, frame: Frame, note: Note) -> list[Json]:
+    """The occupied cells of the last grid on a topic."""
+    messages = deque(log.messages([topic]), maxlen=1)
+    if not messages:
         return []
+    last, is_stated = messages[0], topic in sources.topics
+    channel = last.channel
     try:
         message = decoder_for(channel)(last.data)
         if channel.schema_name in ROS_GRIDS:
@@ -331,15 +325,15 @@ def _from_grid(log: MissionLog, channel: Channel, sources: ObstacleSources, fram
         else:
             return []
     except (UndecodableChannel, UndecodableMessage, ValueError, TypeError, LookupError) as error:
-        note(f"{log.path}: the grid on {channel.topic} is left out ({error})")
+        note(f"{log.path}: the grid on {topic} is left out ({error})")
         return []
     if not is_stated and (frame.is_georeferenced or grid.frame_id not in ("", frame.frame_id)):
         note(
-            f"{log.path}: the grid on {channel.topic} is in frame {grid.frame_id!r}, not in the mission frame "
+            f"{log.path}: the grid on {topic} is in frame {grid.frame_id!r}, not in the mission frame "
             f"{frame.frame_id!r}, and is left out; name it in obstacles.topics to use it as it is"
         )
         return []
-    name = {"name": channel.topic}
+    name = {"name": topic}
     return [_checked({"kind": "polygon", "rings_m": rings, **name}) for rings in occupied_polygons(grid)]
 
 

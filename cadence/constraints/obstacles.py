@@ -16,6 +16,8 @@ from torch import Tensor
 
 _CHUNK = 4_000_000
 """Point-obstacle pairs evaluated at once: bounds the memory at some hundred MB."""
+_FEW_POLYGONS = 100
+"""Up to here, comparing every point with every polygon's box is quicker than a search tree."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,8 +104,18 @@ class Obstacles:
         return torch.cat([self.circles.double().cpu(), torch.tensor(equal, dtype=torch.float64).reshape(-1, 3)])
 
     @cached_property
-    def _edges(self) -> tuple["_EdgeIndex", ...]:
-        return tuple(_EdgeIndex([shape]) for shape in self.shapes)
+    def tree(self) -> shapely.STRtree:
+        """A search tree of the boxes of `shapes`."""
+        return shapely.STRtree(self.shapes)
+
+    def _edges(self, polygon: int) -> "_EdgeIndex":
+        if polygon not in self._edges_known:
+            self._edges_known[polygon] = _EdgeIndex([self.shapes[polygon]])
+        return self._edges_known[polygon]
+
+    @cached_property
+    def _edges_known(self) -> dict[int, "_EdgeIndex"]:
+        return {}
 
     @cached_property
     def _all_edges(self) -> "_EdgeIndex":
@@ -146,7 +158,7 @@ class _SignedDistance(torch.autograd.Function):
             part = slice(first, first + rows)
             _merge_circles(flat[part], obstacles.circles.to(flat), distance[part], gradient[part])
         if len(obstacles.polygons):
-            _merge_polygons(flat, obstacles, distance, gradient)
+            _merge_polygons(flat, obstacles, limit_m, distance, gradient)
         gradient = gradient.reshape(position_m.shape)
         ctx.save_for_backward(gradient)
         ctx.mark_non_differentiable(gradient)
@@ -173,26 +185,36 @@ def _merge_circles(position_m: Tensor, circles: Tensor, distance: Tensor, gradie
     distance[is_nearer] = nearest[is_nearer]
 
 
-def _merge_polygons(position_m: Tensor, obstacles: Obstacles, distance: Tensor, gradient: Tensor) -> None:
+def _merge_polygons(position_m: Tensor, obstacles: Obstacles, limit_m: float, distance: Tensor, gradient: Tensor) -> None:
     """The same for polygons: first the points inside (the deepest polygon), then the nearest edge of all for the others."""
     point = position_m.detach().cpu().numpy()
     best, slope = distance.cpu().numpy().copy(), gradient.cpu().numpy().copy()
-    limit = np.where(np.isfinite(best), np.maximum(best, 0.0), np.inf)
-    is_inside = np.zeros(len(point), dtype=bool)
-    is_near = np.zeros(len(point), dtype=bool)
-    for shape, edges in zip(obstacles.shapes, obstacles._edges, strict=True):
-        west, south, east, north = shapely.bounds(shape)
-        with np.errstate(invalid="ignore"):
-            gap = np.maximum(np.maximum([west, south] - point, point - [east, north]), 0).max(axis=1)
-            is_near |= gap < limit
-            candidate = np.flatnonzero(gap <= 0)
-        inside = candidate[shapely.contains_xy(shape, point[candidate, 0], point[candidate, 1])]
-        is_inside[inside] = True
-        _lower(best, slope, inside, *edges.nearest(point[inside], sign=-1.0))
-    outside = np.flatnonzero(is_near & ~is_inside)
-    _lower(best, slope, outside, *obstacles._all_edges.nearest(point[outside], sign=1.0))
+    is_free = np.isfinite(point).all(axis=1) & _may_be_near(point, shapely.bounds(obstacles.shapes), limit_m)
+    index, polygon = obstacles.tree.query(shapely.points(point[is_free]))
+    index = np.flatnonzero(is_free)[index]
+    inside = shapely.contains_xy(obstacles.shapes[polygon], point[index, 0], point[index, 1])
+    index, polygon = index[inside], polygon[inside]
+    for number in np.unique(polygon).tolist():
+        its = index[polygon == number]
+        _lower(best, slope, its, *obstacles._edges(number).nearest(point[its], sign=-1.0))
+    is_free[index] = False
+    if limit_m > 0:
+        outside = np.flatnonzero(is_free & (best > 0))
+        near = obstacles._all_edges.near(point[outside], limit_m)
+        _lower(best, slope, outside[near], *obstacles._all_edges.nearest(point[outside[near]], sign=1.0))
     distance.copy_(torch.from_numpy(best))
     gradient.copy_(torch.from_numpy(slope))
+
+
+def _may_be_near(point: NDArray[np.float64], boxes: NDArray[np.float64], limit_m: float) -> NDArray[np.bool_]:
+    """A quick look at which points [N, 2] are within limit_m of a box [P, 4]; all of them where there are many boxes."""
+    if len(boxes) > _FEW_POLYGONS or not np.isfinite(limit_m):
+        return np.ones(len(point), dtype=bool)
+    x, y = point.T.copy()
+    is_near = np.zeros(len(point), dtype=bool)
+    for west, south, east, north in boxes + limit_m * np.array([-1.0, -1.0, 1.0, 1.0]):
+        is_near |= (x >= west) & (x <= east) & (y >= south) & (y <= north)
+    return is_near
 
 
 def _lower(
@@ -217,6 +239,13 @@ class _EdgeIndex:
         self.start = edges[:, 0]
         self.along = edges[:, 1] - edges[:, 0]
         self.tree = shapely.STRtree(shapely.linestrings(edges))
+
+    def near(self, point: NDArray[np.float64], limit_m: float) -> NDArray[np.intp]:
+        """Indices of the points [N, 2] that may be nearer than limit_m to an edge."""
+        if not np.isfinite(limit_m):
+            return np.arange(len(point))
+        low, high = (point - limit_m).T, (point + limit_m).T
+        return np.unique(self.tree.query(shapely.box(*low, *high))[0])
 
     def nearest(self, point: NDArray[np.float64], sign: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Signed distance [N] to the nearest edge and its gradient [N, 2]; sign -1 for points inside."""

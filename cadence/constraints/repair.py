@@ -1,14 +1,12 @@
 """The last step of inference: tracks that cross an obstacle are led around it, the detections stay where they are.
 
-A track is cut at its pinned steps into legs. In each leg, the spans that collide are replaced by the shortest way
+A track is cut at its pinned steps into legs; in each leg, the spans that collide (`spans`) are replaced by the shortest way
 around (`roadmap`), and their steps and some neighbours are laid along it in the old rhythm (`placement`). What cannot
 be led around with the margin that was asked for is tried again with smaller ones; the checker has the last word.
 """
 
-import itertools
-import math
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import shapely
@@ -20,13 +18,12 @@ from cadence.constraints.checker import absolute_array, segments_in_collision, s
 from cadence.constraints.obstacles import Obstacles
 from cadence.constraints.placement import arc_length, place
 from cadence.constraints.roadmap import MAX_CORNERS, Growth, Request, Zone
+from cadence.constraints.spans import Case, Leg, Span, colliding_legs, diagnose, new_span, which_touch
 
 FloatArray = NDArray[np.float64]
 
 _STRETCH = 1.15
 """Steps may become this much longer before further neighbours share the detour."""
-_RUN_UP = 0.4
-"""Free steps before and after a collision that take part in the way round, as a share of the colliding ones."""
 _DETOUR = 1.5
 """How much longer than the shortest a way on the side where most of the track already is may be."""
 _WIDEN_ROUNDS = 8
@@ -55,13 +52,11 @@ def repair(
     pinned = is_pinned.expand(position_m.shape[:-1]).reshape(track.shape[:2]).cpu().numpy()
     repaired = track.copy()
     if obstacles.count and track.size:
-        precision = float(position_m.detach().abs().nan_to_num(0.0, 0.0, 0.0).max()) * torch.finfo(position_m.dtype).eps
-        precision = max(precision, float(np.nanmax(np.abs(track), initial=0.0)) * 1e-14)
-        legs: list[_Leg] | None = None
-        for growth in (growths := _growths(obstacles, margin_m, 4 * precision)):
+        legs: list[Leg] | None = None
+        for growth in (growths := _growths(obstacles, margin_m, position_m.dtype)):
             if legs is None or legs:
                 zone = Zone(obstacles, growth)
-                legs = _colliding_legs(track, pinned, zone) if legs is None else legs
+                legs = colliding_legs(track, pinned, zone) if legs is None else legs
                 legs = _repair_legs(track, repaired, pinned, legs, zone, growth is growths[-1])
     changed = torch.from_numpy((repaired != track).any(axis=-1)).reshape(position_m.shape[:-1])
     if not bool(changed.any()):
@@ -74,78 +69,27 @@ def repair(
     return moved, ~(collides | states_in_collision(moved, obstacles, offset_m=offset_m).any(dim=-1))
 
 
-@dataclass(frozen=True)
-class _Leg:
-    """Steps low..high of one track; nothing between them is pinned, the ends may be."""
-
-    row: int
-    low: int
-    high: int
-
-
-@dataclass(frozen=True, eq=False)
-class _Span:
-    """Steps first..last of a leg whose way between collides. An open end is that of the leg, and may move."""
-
-    first: int
-    last: int
-    parts: frozenset[int]
-    is_open_start: bool
-    is_open_end: bool
-    path: FloatArray | None = None
-    """The way round [P, 2], from the position of `first` (or where it was moved to) to that of `last`."""
-
-
-@dataclass(frozen=True, eq=False)
-class _Case:
-    """A leg to repair: its positions [n, 2], which steps are bad [n], which of its ends are pinned, its region, its spans."""
-
-    leg: _Leg
-    point: FloatArray
-    is_bad: NDArray[np.bool_]
-    is_pinned: tuple[bool, bool]
-    region: int
-    spans: tuple[_Span, ...]
-
-
-def _growths(obstacles: Obstacles, margin_m: float, precision_m: float) -> list[Growth]:
+def _growths(obstacles: Obstacles, margin_m: float, dtype: torch.dtype) -> list[Growth]:
     """From what was asked for to what just keeps clear: the second and third only see legs that the first cannot repair."""
     boxes = shapely.bounds(obstacles.shapes)
     size = float(np.median([*2 * obstacles.circle_array[:, 2], *np.hypot(*(boxes[:, 2:] - boxes[:, :2]).T)]))
-    least = max(precision_m, 1e-9 * size)
-    wide = max(0.02 * size, 0.25 * margin_m, 2 * least)
+    # Rounding to the tracks' type must not bring a way into an obstacle. By the obstacles alone, not by the tracks: how a
+    # hypothesis is repaired must not depend on the others. In single precision enough for 800 sizes from the datum.
+    least = size * (1e-4 if dtype.itemsize < 8 else 1e-9)
+    wide = max(0.02 * size, 0.25 * margin_m)
     growths = [Growth(margin_m + least, wide)] if margin_m > least else []
-    return [*growths, Growth(least, wide), Growth(least, max(0.001 * size, 2 * least), core_sides=256, outline_sides=24)]
-
-
-def _colliding_legs(track: FloatArray, pinned: NDArray[np.bool_], zone: Zone) -> list[_Leg]:
-    """The legs of all tracks that touch the zone; tracks far from it, or with NaN, cost next to nothing."""
-    whole = np.flatnonzero(np.isfinite(track).all(axis=(1, 2)))
-    near = whole[zone.near(track[whole].min(axis=1), track[whole].max(axis=1))]
-    touches = (_hits(track[near], zone) >= 0).any(axis=1)
-    return [_Leg(row, low, high) for row in near[touches].tolist() for low, high in _cuts(pinned[row])]
-
-
-def _cuts(pinned: NDArray[np.bool_]) -> Iterator[tuple[int, int]]:
-    cuts = sorted({0, *np.flatnonzero(pinned).tolist(), len(pinned) - 1})
-    yield from itertools.pairwise(cuts if len(cuts) > 1 else [0, 0])
-
-
-def _hits(point: FloatArray, zone: Zone) -> NDArray[np.intp]:
-    """The component in the way of every segment [R, T-1] (-1: none) of tracks [R, T, 2]; a single step is its own segment."""
-    start, end = (point, point) if point.shape[1] == 1 else (point[:, :-1], point[:, 1:])
-    return zone.hits(start.reshape(-1, 2), end.reshape(-1, 2)).reshape(start.shape[:2])
+    return [*growths, Growth(least, wide), Growth(0.1 * least, 0.001 * size, core_sides=256, outline_sides=24)]
 
 
 def _repair_legs(
-    track: FloatArray, repaired: FloatArray, pinned: NDArray[np.bool_], legs: list[_Leg], zone: Zone, is_last: bool
-) -> list[_Leg]:
+    track: FloatArray, repaired: FloatArray, pinned: NDArray[np.bool_], legs: list[Leg], zone: Zone, is_last: bool
+) -> list[Leg]:
     """Repair what can be repaired against one zone, into `repaired`; returns the legs that could not."""
-    cases, failed = _diagnose(track, pinned, legs, zone, is_last)
+    cases, failed = diagnose(track, pinned, legs, zone, is_last)
     cases, unrouted = _route(cases, zone)
     for is_strict in (False, True):
         placed = [(case, _place_case(case, is_strict)) for case in cases]
-        is_blocked = _blocked([point for _, point in placed], zone)
+        is_blocked = which_touch([point for _, point in placed], zone)
         for (case, point), blocked in zip(placed, is_blocked, strict=True):
             if not blocked:
                 repaired[case.leg.row, case.leg.low : case.leg.high + 1] = point
@@ -157,71 +101,7 @@ def _repair_legs(
     return [case.leg for case in failed]
 
 
-def _diagnose(
-    track: FloatArray, pinned: NDArray[np.bool_], legs: Sequence[_Leg], zone: Zone, is_last: bool
-) -> tuple[list[_Case], list[_Case]]:
-    """The legs that collide, as cases that have a chance, and as cases that have none against this zone."""
-    rows = np.unique([leg.row for leg in legs]).astype(np.intp)
-    points = track[rows]
-    region = zone.regions(points.reshape(-1, 2)).reshape(points.shape[:2])
-    part = _hits(points, zone)
-    cases, failed = [], []
-    for leg in legs:
-        row = int(np.searchsorted(rows, leg.row))
-        # A pinned step inside stays where it is: the rest of the leg is repaired as if it ended beside it.
-        ends = [pinned[leg.row, step] and region[row, step] < 0 for step in (leg.low, leg.high)]
-        if any(ends) and is_last:
-            leg = replace(leg, low=leg.low + int(ends[0]), high=leg.high - int(ends[1]))
-        if leg.low > leg.high:
-            continue
-        steps, segments = slice(leg.low, leg.high + 1), slice(leg.low, max(leg.high, leg.low + (part.shape[1] == 1)))
-        is_pinned = (bool(pinned[leg.row, leg.low]), bool(pinned[leg.row, leg.high]))
-        point, its_region = points[row, steps], region[row, steps]
-        homes = {int(its_region[end]) for end in (0, -1) if is_pinned[end] and its_region[end] >= 0}
-        home = homes.pop() if homes else _most_frequent(its_region)
-        if homes or (any(ends) and not is_last):
-            failed.append(_Case(leg, point, its_region < 0, is_pinned, home, ()))
-        elif spans := _spans(its_region != home, part[row, segments], point, zone):
-            cases.append(_Case(leg, point, its_region != home, is_pinned, home, spans))
-    return cases, failed
-
-
-def _most_frequent(region: NDArray[np.intp]) -> int:
-    free = region[region >= 0]
-    return int(np.bincount(free).argmax()) if len(free) else 0
-
-
-def _spans(is_bad: NDArray[np.bool_], part: NDArray[np.intp], point: FloatArray, zone: Zone) -> tuple[_Span, ...]:
-    """The runs of colliding segments; runs that are only parted by steps in a bay of the same component are one."""
-    if len(is_bad) == 1:
-        return (_span(0, 0, frozenset(part[part >= 0].tolist()), is_bad),) if is_bad[0] else ()
-    is_hit = (part >= 0) | is_bad[:-1] | is_bad[1:]
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], is_hit, [False]]).astype(np.int8)))
-    spans: list[_Span] = []
-    for first, last in edges.reshape(-1, 2).tolist():
-        parts = frozenset(part[first:last][part[first:last] >= 0].tolist())
-        before = spans[-1] if spans else None
-        if before is not None and any(zone.hull_holds(p, point[before.last : first + 1]) for p in parts & before.parts):
-            spans[-1] = _span(before.first, last, parts | before.parts, is_bad)
-        else:
-            spans.append(_span(first, last, parts, is_bad))
-    return tuple(_with_run_up(spans, is_bad))
-
-
-def _with_run_up(spans: Sequence[_Span], is_bad: NDArray[np.bool_]) -> Iterator[_Span]:
-    """The spans with some free steps before and after, so that a way round turns off before it stands at the wall."""
-    for index, span in enumerate(spans):
-        reach = math.ceil(_RUN_UP * (span.last - span.first))
-        floor = 0 if index == 0 else (spans[index - 1].last + span.first + 1) // 2
-        ceiling = len(is_bad) - 1 if index + 1 == len(spans) else (span.last + spans[index + 1].first) // 2
-        yield _span(max(floor, span.first - reach), min(ceiling, span.last + reach), span.parts, is_bad)
-
-
-def _span(first: int, last: int, parts: frozenset[int], is_bad: NDArray[np.bool_]) -> _Span:
-    return _Span(first, last, parts, is_open_start=bool(is_bad[first]), is_open_end=bool(is_bad[last]))
-
-
-def _route(cases: list[_Case], zone: Zone) -> tuple[list[_Case], list[_Case]]:
+def _route(cases: list[Case], zone: Zone) -> tuple[list[Case], list[Case]]:
     """The cases with a path for every span, and those for which none was found even between the ends of the leg."""
     routed, unrouted = [], []
     for attempt in range(_WIDEN_ROUNDS):
@@ -242,7 +122,7 @@ def _route(cases: list[_Case], zone: Zone) -> tuple[list[_Case], list[_Case]]:
     return routed, unrouted + cases
 
 
-def _widened(case: _Case, steps: int) -> _Case | None:
+def _widened(case: Case, steps: int) -> Case | None:
     """The case with more steps for its spans without path, overlapping spans merged; None where there are no more."""
     end = len(case.point) - 1
     if any(span.path is None and (span.first, span.last) == (0, end) for span in case.spans):
@@ -250,19 +130,19 @@ def _widened(case: _Case, steps: int) -> _Case | None:
         opened = replace(span, is_open_start=not case.is_pinned[0], is_open_end=not case.is_pinned[1])
         is_news = (opened.is_open_start, opened.is_open_end) != (span.is_open_start, span.is_open_end)
         return replace(case, spans=(opened,)) if is_news else None
-    spans: list[_Span] = []
+    spans: list[Span] = []
     for span in case.spans:
         if span.path is None:
-            span = _span(max(0, span.first - steps), min(end, span.last + steps), span.parts, case.is_bad)
+            span = new_span(max(0, span.first - steps), min(end, span.last + steps), span.parts, case.is_bad)
         while spans and spans[-1].last > span.first:
             before = spans.pop()
             first, last = min(before.first, span.first), max(before.last, span.last)
-            span = _span(first, last, before.parts | span.parts, case.is_bad)
+            span = new_span(first, last, before.parts | span.parts, case.is_bad)
         spans.append(span)
     return replace(case, spans=tuple(spans))
 
 
-def _paths(wanted: Sequence[tuple[_Case, _Span]], zone: Zone) -> list[FloatArray | None]:
+def _paths(wanted: Sequence[tuple[Case, Span]], zone: Zone) -> list[FloatArray | None]:
     """The way round for each span, [P, 2] from start to end, or None."""
     paths: list[FloatArray | None] = [None] * len(wanted)
     requests = {}
@@ -286,7 +166,7 @@ def _paths(wanted: Sequence[tuple[_Case, _Span]], zone: Zone) -> list[FloatArray
     return paths
 
 
-def _request(case: _Case, span: _Span, zone: Zone) -> Request | None:
+def _request(case: Case, span: Span, zone: Zone) -> Request | None:
     ends = np.array([span.first, span.last])
     point, is_bad = case.point[ends], case.is_bad[ends]
     if is_bad.any():
@@ -301,7 +181,7 @@ def _request(case: _Case, span: _Span, zone: Zone) -> Request | None:
     return Request(point[0], point[1], corners, hop_cost, tuple(sorted(span.parts)))
 
 
-def _barrier(case: _Case, span: _Span, path: FloatArray, zone: Zone) -> FloatArray | None:
+def _barrier(case: Case, span: Span, path: FloatArray, zone: Zone) -> FloatArray | None:
     """A ray across the side of `path`, where most of the colliding steps are nearer to the other side; else None."""
     inside = case.point[span.first + 1 : span.last][case.is_bad[span.first + 1 : span.last]]
     chord = path[-1] - path[0]
@@ -321,7 +201,7 @@ def _barrier(case: _Case, span: _Span, path: FloatArray, zone: Zone) -> FloatArr
     return np.stack([middle, middle + side * reach * left])
 
 
-def _place_case(case: _Case, is_strict: bool) -> FloatArray | None:
+def _place_case(case: Case, is_strict: bool) -> FloatArray | None:
     """The positions [n, 2] of the leg with every span laid along its path; `is_strict` keeps to the spans' own steps."""
     point, end = case.point.copy(), len(case.point) - 1
     for index, span in enumerate(case.spans):
@@ -345,7 +225,7 @@ def _place_case(case: _Case, is_strict: bool) -> FloatArray | None:
     return point
 
 
-def _stretch(point: FloatArray, span: _Span, low: int, high: int) -> float:
+def _stretch(point: FloatArray, span: Span, low: int, high: int) -> float:
     """How much longer the way low..high of a leg becomes by the detour of a span."""
     assert span.path is not None
     walked = arc_length(point)
@@ -354,7 +234,7 @@ def _stretch(point: FloatArray, span: _Span, low: int, high: int) -> float:
     return float(new / old) if old > 0 else np.inf
 
 
-def _share(point: FloatArray, span: _Span, floor: int, ceiling: int) -> tuple[int, int]:
+def _share(point: FloatArray, span: Span, floor: int, ceiling: int) -> tuple[int, int]:
     """The fewest steps around a span, low..high, that share its detour so that none becomes much longer than it was."""
     low, high = span.first, span.last
     while (low > floor or high < ceiling) and _stretch(point, span, low, high) > _STRETCH:
@@ -385,19 +265,7 @@ def _lay(old: FloatArray, path: FloatArray, bends: slice, is_open: tuple[bool, b
     return new
 
 
-def _blocked(points: Sequence[FloatArray | None], zone: Zone) -> list[bool]:
-    """Which tracks [n, 2] touch the zone; those that are None do."""
-    found = [point for point in points if point is not None]
-    if not found:
-        return [True] * len(points)
-    start = np.concatenate([point[:-1] if len(point) > 1 else point for point in found])
-    end = np.concatenate([point[1:] if len(point) > 1 else point for point in found])
-    owner = np.repeat(np.arange(len(found)), [max(len(point) - 1, 1) for point in found])
-    touches = iter(np.bincount(owner, zone.hits(start, end) >= 0, len(found)) > 0)
-    return [True if point is None else bool(next(touches)) for point in points]
-
-
-def _pushed_out(case: _Case, zone: Zone) -> FloatArray:
+def _pushed_out(case: Case, zone: Zone) -> FloatArray:
     """The leg with every colliding step at the nearest free point: the most that can be done without a way round."""
     exits = zone.exits(case.point, case.region)
     return case.point if exits is None else np.where(case.is_bad[:, None], exits, case.point)

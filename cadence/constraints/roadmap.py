@@ -4,7 +4,7 @@ Everything is planned against two growths of the obstacles: routes must not touc
 their waypoints are corners of the `outline` (a little larger), so that rounding never decides whether a route is free.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -17,9 +17,15 @@ from cadence.constraints.obstacles import Obstacles
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
+_Parts = frozenset[int]
+"""Components of the outline."""
+_Box = tuple[float, int, int]
+"""A part of the world: half its side in metres, and its middle in units of that."""
 
-_MAX_BENDS = 96
-"""Corners of one component that take part in a search; larger outlines are simplified, outwards."""
+_MAX_BENDS = 160
+"""Corners that take part in one search; where there are more, outlines are simplified, outwards."""
+_REACHES = (1.0, 4.0, 32.0)
+"""Where no route is found near the components in the way, one is sought farther out."""
 MAX_CORNERS = 24
 """The most corners of one route."""
 _CHUNK = 20_000_000
@@ -63,9 +69,9 @@ class Zone:
         holes = [shapely.Polygon(ring) for part in self.core.shapes for ring in part.interiors]
         # Largest first, so that the innermost of nested holes names the region.
         self.holes = _Index(np.array(sorted(holes, key=lambda hole: -hole.area), dtype=object))
-        self._bends: dict[int, FloatArray] = {}
-        self._between: dict[tuple[int, int], FloatArray] = {}
-        self._graphs: dict[tuple[int, ...], _Graph] = {}
+        self._known_shapes: dict[tuple[int, int], Any] = {}
+        self._known_bends: dict[tuple[int, int], FloatArray] = {}
+        self._graphs: dict[_Parts | _Box, _Graph] = {}
 
     def near(self, low: FloatArray, high: FloatArray) -> IntArray:
         """Indices of the boxes from low to high [N, 2] that meet the box of a component."""
@@ -83,6 +89,11 @@ class Zone:
         segment, part = self.core.touching(shapely.linestrings(np.stack([start, end], axis=1)))
         found[segment] = self._outline_of_core[part]
         return found
+
+    def blocks(self, start: FloatArray, end: FloatArray) -> NDArray[np.bool_]:
+        """Whether the core touches segments from start to end [..., 2]; the quick form of `hits`."""
+        blocked: NDArray[np.bool_] = shapely.intersects(self._whole, shapely.linestrings(np.stack([start, end], axis=-2)))
+        return blocked
 
     def regions(self, point: FloatArray) -> IntArray:
         """The region of free space of points [N, 2]: 0 outside everything, 1 + hole inside a hole, -1 in the core."""
@@ -110,49 +121,94 @@ class Zone:
     def routes(self, requests: Sequence[Request]) -> list[FloatArray | None]:
         """The shortest route of each request as its waypoints [m, 2] (start and end left out); None where there is none."""
         found: list[FloatArray | None] = [None] * len(requests)
-        for widen in (False, True):
-            groups: dict[tuple[int, ...], list[int]] = {}
+        for reach in _REACHES:
+            groups: dict[_Parts | _Box, list[int]] = {}
             for index, request in enumerate(requests):
                 if found[index] is None:
-                    groups.setdefault(self._neighbourhood(request.parts, widen), []).append(index)
-            for parts, members in groups.items():
-                graph = self._graph(parts)
+                    parts = self._neighbourhood(request.parts, reach)
+                    is_simple = sum(len(self._bends(part, 0)) for part in parts) <= _MAX_BENDS
+                    groups.setdefault(parts if is_simple else self._box(request, reach), []).append(index)
+            for key, members in groups.items():
+                graph = self._graph(key)
                 for index, route in zip(members, graph.search(self, [requests[m] for m in members]), strict=True):
                     found[index] = route
         return found
 
-    def _graph(self, parts: tuple[int, ...]) -> "_Graph":
-        if parts not in self._graphs:
-            corners = np.concatenate([np.zeros((0, 2)), *(self._corners(part) for part in parts)])
-            blocks = [[self._lengths(a, b) for b in parts] for a in parts]
-            self._graphs[parts] = _Graph(corners, np.block(blocks) if parts else np.zeros((0, 0)))
-        return self._graphs[parts]
-
-    def _corners(self, part: int) -> FloatArray:
-        if part not in self._bends:
-            bends = _bends(self.outline.shapes[part], self.growth.clearance_m)
-            self._bends[part] = bends[self.regions(bends) >= 0]
-        return self._bends[part]
-
-    def _lengths(self, a: int, b: int) -> FloatArray:
-        """Lengths of the free segments between the corners of two components; each pair is looked at once."""
-        if a > b:
-            return self._lengths(b, a).T
-        if (a, b) not in self._between:
-            start, end = self._corners(a), self._corners(b)
-            shape = (len(start), len(end), 2)
-            lengths = _free_lengths(self, np.broadcast_to(start[:, None], shape), np.broadcast_to(end, shape))
-            self._between[a, b] = lengths
-        return self._between[a, b]
-
-    def _neighbourhood(self, parts: tuple[int, ...], widen: bool) -> tuple[int, ...]:
-        """The components in the way and those near them; with `widen` also those that are far."""
+    def _neighbourhood(self, parts: tuple[int, ...], reach: float) -> "_Parts":
+        """The components in the way and those no farther from them than a quarter of `reach` times their size."""
         near = set(parts)
         for part in parts:
             west, south, east, north = shapely.bounds(self.outline.shapes[part])
-            reach = (2.0 if widen else 0.25) * self.size(part)
-            near.update(self.outline.tree.query(shapely.box(west - reach, south - reach, east + reach, north + reach)).tolist())
-        return tuple(sorted(near))
+            far = 0.25 * reach * self.size(part)
+            near.update(self.outline.tree.query(shapely.box(west - far, south - far, east + far, north + far)).tolist())
+        return frozenset(near)
+
+    def _box(self, request: Request, reach: float) -> "_Box":
+        """A box about the ends of a request; rounded, so that requests that are near each other share it."""
+        ends = np.stack([request.start, request.end])
+        span = float(np.hypot(*(ends[1] - ends[0]))) + self.growth.clearance_m
+        size = max([span, *(min(self.size(part), 4 * span) for part in request.parts)])
+        side = reach * 2.0 ** float(np.ceil(np.log2(size)))
+        column, row = np.round(ends.mean(axis=0) / side).tolist()
+        return side, int(column), int(row)
+
+    def _graph(self, key: "_Parts | _Box") -> "_Graph":
+        if key not in self._graphs:
+            if isinstance(key, frozenset):
+                bends = _joined(self._bends(part, 0) for part in sorted(key))
+            else:
+                bends = self._local_bends(key)
+            bends = bends[self.regions(bends[:, 1]) >= 0]
+            self._graphs[key] = _Graph.build(self, bends, is_taut=not isinstance(key, frozenset))
+        return self._graphs[key]
+
+    def _local_bends(self, box: "_Box") -> FloatArray:
+        """Bends [V, 3, 2] in a box, from simplified outlines where there are too many; the middle ones if all else fails."""
+        side, column, row = box
+        middle = side * np.array([column, row])
+        parts = self.outline.tree.query(shapely.box(*(middle - side), *(middle + side))).tolist()
+        # A tenth of the box is the coarsest that still shows a way through it, and an eightieth the finest that matters.
+        coarsest = max(0, int(np.log2(0.1 * side / self.growth.clearance_m)))
+        for level in range(max(0, coarsest - 3), coarsest + 1):
+            bends = _joined(self._bends(part, level) for part in parts)
+            bends = bends[(np.abs(bends[:, 1] - middle) <= side).all(axis=1)]
+            if len(bends) <= _MAX_BENDS:
+                return bends
+        distance = np.abs(bends[:, 1] - middle).max(axis=1)
+        nearest: FloatArray = bends[np.sort(np.argsort(distance, kind="stable")[:_MAX_BENDS])]
+        return nearest
+
+    def _bends(self, part: int, level: int) -> FloatArray:
+        """Bends of a component whose outline was simplified by clearance · 2^level (level 0: not at all)."""
+        if (part, level) not in self._known_bends:
+            clearance = self.growth.clearance_m
+            if level == 0:
+                bends = _joined([*_convex_bends(self.outline.shapes[part]), _loose_bends(self.outline.shapes[part], clearance)])
+            elif self.size(part) > 4 * clearance * 2.0**level:
+                bends = _joined(_convex_bends(self._simplified(part, level)))
+            else:
+                # What is small in this search is gone around by its box.
+                bends = _loose_bends(self.outline.shapes[part], clearance)[:4]
+            self._known_bends[part, level] = bends
+        return self._known_bends[part, level]
+
+    def _simplified(self, part: int, level: int) -> Any:
+        if level <= 0:
+            return self.outline.shapes[part]
+        if (part, level) not in self._known_shapes:
+            # From a shape that is simplified already: large outlines are gone through once, not once a level.
+            base = level - 4
+            tolerance = self.growth.clearance_m * (2.0**level - (2.0**base if base > 0 else 0.0))
+            # A line simplified by less than it was moved out still lies outside of where it came from.
+            grown = self._simplified(part, base).buffer(tolerance, join_style="mitre", mitre_limit=2.5)
+            self._known_shapes[part, level] = grown.simplify(0.9 * tolerance)
+        return self._known_shapes[part, level]
+
+    @cached_property
+    def _whole(self) -> Any:
+        whole = shapely.MultiPolygon(self.core.shapes.tolist())
+        shapely.prepare(whole)
+        return whole
 
     @cached_property
     def _outline_of_core(self) -> IntArray:
@@ -199,17 +255,33 @@ class _Index:
 
 @dataclass(frozen=True, eq=False)
 class _Graph:
-    """Corners that routes may bend at [V, 2] and the lengths [V, V] of the free segments between them, else infinite."""
+    """Bends [V, 3, 2]: corners of routes between their neighbours on the outline; lengths [V, V] of free segments, else inf."""
 
-    corners: FloatArray
+    bends: FloatArray
     length: FloatArray
+
+    @property
+    def corners(self) -> FloatArray:
+        """The corners themselves [V, 2]."""
+        return self.bends[:, 1]
+
+    @staticmethod
+    def build(zone: Zone, bends: FloatArray, is_taut: bool = False) -> "_Graph":
+        row, column = np.triu_indices(len(bends), k=1)
+        if is_taut:
+            useful = _touches_lightly(bends[row, 1], bends[column]) & _touches_lightly(bends[column, 1], bends[row])
+            row, column = row[useful], column[useful]
+        length = np.full((len(bends), len(bends)), np.inf)
+        length[row, column] = length[column, row] = _free_lengths(zone, bends[row, 1], bends[column, 1])
+        return _Graph(bends, length)
 
     def search(self, zone: Zone, requests: Sequence[Request]) -> list[FloatArray | None]:
         """The shortest route of every request."""
         start, end = np.stack([r.start for r in requests]), np.stack([r.end for r in requests])
-        shape = (len(requests), len(self.corners), 2)
-        corners = np.broadcast_to(self.corners, shape)
-        ends = [_free_lengths(zone, np.broadcast_to(p[:, None], shape), corners) for p in (start, end)]
+        ends = []
+        for point in (start, end):
+            shape = (len(point), len(self.bends), 2)
+            ends.append(_free_lengths(zone, np.broadcast_to(point[:, None], shape), np.broadcast_to(self.corners, shape)))
         direct = _free_lengths(zone, start, end)
         routes: list[FloatArray | None] = [None] * len(requests)
         free = [index for index, request in enumerate(requests) if request.barrier is None]
@@ -264,8 +336,18 @@ def _free_lengths(zone: Zone, start: FloatArray, end: FloatArray) -> FloatArray:
     """Lengths [...] of the segments from start to end [..., 2]; infinite where the core is in the way."""
     delta = end - start
     length: FloatArray = np.hypot(delta[..., 0], delta[..., 1])
-    blocked = zone.hits(start.reshape(-1, 2), end.reshape(-1, 2)).reshape(length.shape) >= 0
-    return np.where(blocked, np.inf, length)
+    return np.where(zone.blocks(start, end), np.inf, length)
+
+
+def _touches_lightly(point: FloatArray, bend: FloatArray) -> NDArray[np.bool_]:
+    """Whether segments from point [..., 2] pass bends [..., 3, 2] with the outline on one side: only such can be shortest.
+
+    Bends with NaN for neighbours belong to no outline and are always passed lightly.
+    """
+    corner = bend[..., 1, :]
+    before, after = (_cross(corner - point, bend[..., side, :] - corner) for side in (0, 2))
+    light: NDArray[np.bool_] = ~(before * after < 0)
+    return light
 
 
 def _crosses(start: FloatArray, end: FloatArray, barrier: FloatArray) -> NDArray[np.bool_]:
@@ -282,30 +364,27 @@ def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
     return product
 
 
-def _bends(part: Any, clearance_m: float) -> FloatArray:
-    """Corners of a component that a shortest route can bend at, and a few farther out for tracks with few steps."""
-    shape, tolerance = part, clearance_m
-    corners = _convex_corners(shape)
-    while len(corners) > _MAX_BENDS and tolerance < 1e6 * clearance_m:
-        # A line simplified by less than it was moved out still lies outside of where it came from.
-        shape = part.buffer(tolerance, join_style="mitre", mitre_limit=2.5).simplify(0.9 * tolerance)
-        corners, tolerance = _convex_corners(shape), 2 * tolerance
+def _loose_bends(part: Any, clearance_m: float) -> FloatArray:
+    """Ten bends [10, 3, 2] around a component for tracks with few steps: four close to it, six far out."""
     rectangle = shapely.minimum_rotated_rectangle(part)
-    around = shapely.get_coordinates(rectangle.buffer(clearance_m, join_style="mitre"))[:-1]
     angle = np.arange(6) * (np.pi / 3)
-    ring = shapely.minimum_bounding_radius(part) * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    centre = shapely.get_coordinates(shapely.centroid(rectangle))
-    return np.concatenate([corners, around, centre + 2.0 * ring])
+    ring = 2 * shapely.minimum_bounding_radius(part) * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    around = shapely.get_coordinates(rectangle.buffer(clearance_m, join_style="mitre"))[:-1]
+    loose = np.concatenate([around, shapely.get_coordinates(shapely.centroid(rectangle)) + ring])
+    # What stands alone has no neighbours on an outline.
+    return np.stack([np.full_like(loose, np.nan), loose, np.full_like(loose, np.nan)], axis=1)
 
 
-def _convex_corners(shape: Any) -> FloatArray:
-    found = [np.zeros((0, 2))]
+def _joined(bends: Iterable[FloatArray]) -> FloatArray:
+    return np.concatenate([np.full((0, 3, 2), np.nan), *bends])
+
+
+def _convex_bends(shape: Any) -> Iterator[FloatArray]:
     for part in _parts(shape):
         for ring in (part.exterior, *part.interiors):
             corner = shapely.get_coordinates(ring)[:-1]
-            turn = _cross(corner - np.roll(corner, 1, axis=0), np.roll(corner, -1, axis=0) - corner)
-            found.append(corner[turn > 0])
-    return np.concatenate(found)
+            bends = np.stack([np.roll(corner, 1, axis=0), corner, np.roll(corner, -1, axis=0)], axis=1)
+            yield bends[_cross(corner - bends[:, 0], bends[:, 2] - corner) > 0]
 
 
 def _parts(shape: Any) -> NDArray[np.object_]:
