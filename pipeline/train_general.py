@@ -89,7 +89,7 @@ class _LogSource:
     """Windows of a folder of logs; a tenth of the logs, whole, is for validation."""
 
     def __init__(self, out: Path, config: "TrainConfig", progress: Progress) -> None:
-        assert config.data is not None  # noqa: S101 - the caller has looked
+        assert config.data is not None
         missions = missions_of_logs(config.data, out / "logs", config.paper.extract, progress)
         if len(missions) < 2:
             raise InputError(f"{config.data}: one usable log; at least two are needed, as whole logs are kept for validation")
@@ -100,7 +100,7 @@ class _LogSource:
         kept = [part for part in parts[num_validation:] if part is not None]
         if not kept or not held_out:
             raise InputError(
-                f"{config.data}: too few windows whose whole truth is known; longer logs, or a smaller train.windows"
+                f"{config.data}: no windows with truth at every step; use longer logs or a smaller train.windows"
             )
         self.windows, self.validation = join_windows(kept), join_windows(held_out)
 
@@ -109,7 +109,7 @@ class _LogSource:
 
 
 def mission_windows(mission: TrainingMission, config: "TrainConfig", seed: int) -> ResidualWindows | None:
-    """The windows of one log in which truth is known at every step, seen through the bank fitted to that log; None without any."""
+    """Windows of one log with truth at every step, seen through the bank fitted to that log; None without any."""
     grid_config = GridConfig(history_steps=config.windows.history_steps, horizon_steps=config.windows.horizon_steps)
     grid = plan_grid(mission.detections, grid_config)
     windows = build_windows(mission.detections, grid, seed)

@@ -29,13 +29,13 @@ def candidates(bank: Bank) -> tuple[Bank, ...]:
 
 
 def choose_by_hindsight(bank: Bank, windows: WindowBatch, later: Detections) -> Bank:
-    """The candidate with the least `hindsight_score` at the detections `later` [B, A, N] after each window's origin.
+    """The candidate with the least mean of `hindsight_scores` at the detections `later` [B, A, N] after each window's origin.
 
     Without enough of them the bank stays as it is.
     """
     if windows.num_windows == 0 or num_tests(windows, later) < _LEAST_TESTS or bank.log_weight is None:
         return bank
-    scores = [hindsight_score(candidate, windows, later) for candidate in candidates(bank)]
+    scores = [float(hindsight_scores(candidate, windows, later).mean()) for candidate in candidates(bank)]
     return candidates(bank)[scores.index(min(scores))]
 
 
@@ -44,8 +44,10 @@ def num_tests(windows: WindowBatch, shown_later: Detections) -> int:
     return int(_is_used(windows, shown_later).sum())
 
 
-def hindsight_score(estimator: Estimator, windows: WindowBatch, shown_later: Detections) -> float:
-    """Mean energy score at detections [B, A, N] that `windows` do not hold, anywhere on their grid.
+def hindsight_scores(estimator: Estimator, windows: WindowBatch, shown_later: Detections) -> Tensor:
+    """Energy scores at each agent's detections [B, A, N] that `windows` do not hold, anywhere on their grid: their means [R].
+
+    R runs over the agents of windows with any such detection.
 
     Errors are divided by the time to the nearest detection in the window, so that long gaps do not rule alone.
     """
@@ -63,7 +65,8 @@ def hindsight_score(estimator: Estimator, windows: WindowBatch, shown_later: Det
     distance_s = (shown_later.time_s[..., None] - windows.detections.time_s[..., None, :]).abs()
     known = windows.detections.is_observed[..., None, :]
     scale = torch.where(known, distance_s, torch.inf).amin(-1).clamp_min(windows.step_s)
-    return float(((error - 0.5 * spread) / scale)[is_used].mean())
+    score = torch.where(is_used, (error - 0.5 * spread) / scale, 0.0).sum(-1) / is_used.sum(-1).clamp_min(1)
+    return score[is_used.any(-1)]
 
 
 def withhold(windows: WindowBatch, seed: int) -> tuple[WindowBatch, Detections]:

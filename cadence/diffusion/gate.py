@@ -1,8 +1,9 @@
 """The gate: the network takes part, in past and future, only where this log shows that it does not lose to the bank."""
 
 import dataclasses
+import math
 
-from cadence.bank.hindsight import hindsight_score, num_tests, withhold
+from cadence.bank.hindsight import hindsight_scores, num_tests, withhold
 from cadence.diffusion.general import GateScores, GeneralModel
 from cadence.types import Detections, WindowBatch
 
@@ -10,7 +11,10 @@ _LEAST_TESTS = 8
 
 
 def gated(model: GeneralModel, windows: WindowBatch, later: Detections, seed: int = 0) -> GeneralModel:
-    """The model with its network switched off where it scores worse than the bank.
+    """The model with its network switched off where it clearly scores worse than the bank.
+
+    Clearly: by more than one standard error of the difference between paired scores. The network comes from training with
+    the presumption that it helps; a handful of windows must not overturn that.
 
     Args:
         model: with its bank fitted.
@@ -20,14 +24,22 @@ def gated(model: GeneralModel, windows: WindowBatch, later: Detections, seed: in
     """
     if model.network is None or windows.num_windows == 0:
         return model
-    past = _ratio(model, *withhold(windows, seed))
-    future = _ratio(model, windows, later)
-    strength = tuple(1.0 if ratio is None or ratio <= 1.0 else 0.0 for ratio in (past, future))
-    scores = GateScores(past, future)
-    return dataclasses.replace(model, strength_past=strength[0], strength_future=strength[1], gate=scores)
+    past = _compare(model, *withhold(windows, seed))
+    future = _compare(model, windows, later)
+    scores = GateScores(past.ratio, future.ratio)
+    return dataclasses.replace(model, strength_past=past.strength, strength_future=future.strength, gate=scores)
 
 
-def _ratio(model: GeneralModel, windows: WindowBatch, unseen: Detections) -> float | None:
+@dataclasses.dataclass(frozen=True)
+class _Comparison:
+    ratio: float | None
+    strength: float
+
+
+def _compare(model: GeneralModel, windows: WindowBatch, unseen: Detections) -> _Comparison:
     if num_tests(windows, unseen) < _LEAST_TESTS:
-        return None
-    return hindsight_score(model, windows, unseen) / hindsight_score(model.bank, windows, unseen)
+        return _Comparison(None, 1.0)
+    network, bank = (hindsight_scores(estimator, windows, unseen) for estimator in (model, model.bank))
+    difference = network - bank
+    error = float(difference.std()) / math.sqrt(len(difference)) if len(difference) > 1 else math.inf
+    return _Comparison(float(network.mean() / bank.mean()), 0.0 if float(difference.mean()) > error else 1.0)

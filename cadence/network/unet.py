@@ -4,6 +4,7 @@ Ye, Natarajan, Wu, Gombolay, "Diffusion Models for Multi-target Adversarial Trac
 form goes back to Janner et al., "Planning with Diffusion for Flexible Behavior Synthesis" (ICML 2022).
 """
 
+import itertools
 import math
 from dataclasses import dataclass
 from typing import Literal
@@ -140,7 +141,7 @@ class _Block(nn.Module):
 
 def _blocks(config: UNetConfig, channels_in: int, channels_out: int) -> nn.ModuleList:
     widths = [channels_in] + [channels_out] * config.num_blocks
-    return nn.ModuleList(_Block(config, a, b) for a, b in zip(widths[:-1], widths[1:], strict=True))
+    return nn.ModuleList(_Block(config, a, b) for a, b in itertools.pairwise(widths))
 
 
 def _activation(config: UNetConfig) -> nn.Module:

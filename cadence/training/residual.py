@@ -29,7 +29,8 @@ def residual_loss(network: nn.Module, windows: ResidualWindows, generator: torch
     level = angle[:, None, None]
     noisy = torch.cos(level) * clean + torch.sin(level) * noise
     answer = network(noisy, angle, context, network.encode(context))
-    return ((answer.float() - target_of("v", clean, noise, level)) ** 2).mean()
+    error: Tensor = answer.float() - target_of("v", clean, noise, level)
+    return (error**2).mean()
 
 
 def _turned(vectors: Tensor, turn: Tensor, mirror: Tensor) -> Tensor:
