@@ -23,7 +23,7 @@ $(STAMP): pyproject.toml constraints.txt
 	@touch $@
 
 demo: $(STAMP)  ## Simulate a mission, run the whole pipeline on it, say where to look.
-	$(BIN)/cadence simulate --out $(DEMO)/logs --seed 7
+	$(BIN)/cadence simulate --out $(DEMO)/logs --seed 13
 	$(BIN)/cadence run $(DEMO)/logs/*.mcap --out $(DEMO)/results
 	@echo
 	@echo "Look at:"

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
 import pyarrow as pa
 import torch
 from torch import Tensor
@@ -16,30 +15,24 @@ from cadence.bank.bank import Bank
 from cadence.bank.hindsight import choose_by_hindsight
 from cadence.bank.rows import active_rows
 from cadence.constraints.obstacles import Obstacles
+from cadence.diffusion.absolute import AbsoluteSampling
 from cadence.diffusion.feasible import Feasibility, resampled
 from cadence.diffusion.gate import gated
 from cadence.diffusion.general import GeneralModel
 from cadence.errors import ConfigError, DeviceError
 from cadence.network.residual import ResidualNetwork, ResidualNetworkConfig
 from cadence.types import Detections, WindowBatch
+from pipeline.absolute import absolute_grid, draw_absolute, load_absolute
 from pipeline.checkpoints import DEFAULT, checkpoint_hash, find_checkpoint, load_weights, network_config, read_info
+from pipeline.hypothesis_tables import hypothesis_rows, window_rows
 from pipeline.manifest import StageResult, run_stage
 from pipeline.obstacles import read_obstacles
 from pipeline.progress import Progress
 from pipeline.tables import read_table, write_table
 from pipeline.windows import Grid, GridConfig, MissionWindows, build_windows, fit_tracks, later_detections, plan_grid
-from schemas.tables import WINDOWS, hypotheses_schema
 
 _ROWS_AT_ONCE = 48
 _HINDSIGHT_ROWS = 64
-
-ADVICE = {
-    "ok": None,
-    "no_detections": "not detected within this window's history; infer.grid.history_steps or step_s would widen it",
-    "infeasible": "no way around an obstacle between detections; check the obstacles, or lower infer.guidance.margin_m",
-    "guidance_diverged": "sampling did not stay finite, so the bank's samples stand in; report this log",
-}
-"""What to do about each status of a window."""
 
 
 @dataclass(frozen=True)
@@ -71,6 +64,7 @@ class InferConfig:
     num_steps        evaluations of the network a hypothesis
     default_sigma_m  accuracy of detections that state none
     device           "auto", "cpu" or "cuda"
+    paper            how a checkpoint of the paper preset is sampled; it brings its own grid
     is_gated         the network takes part only where, on this log, it foresees withheld detections no worse than the bank
     """
 
@@ -84,6 +78,7 @@ class InferConfig:
     is_gated: bool = True
     grid: GridConfig = field(default_factory=GridConfig)
     guidance: GuidanceConfig = field(default_factory=GuidanceConfig)
+    paper: AbsoluteSampling = field(default_factory=AbsoluteSampling)
 
     def __post_init__(self) -> None:
         if self.num_hypotheses < 1 or self.num_steps < 1 or self.default_sigma_m < 0:
@@ -102,15 +97,23 @@ def infer(directory: Path, config: InferConfig, progress: Progress, force: bool 
     def body(folder: Path) -> dict[str, Any]:
         detections, frame = read_table(directory / "detections.parquet", "detections")
         obstacles = read_obstacles(directory / "obstacles.json")
-        grid = plan_grid(detections, config.grid)
+        absolute = None
+        if weights is not None and read_info(weights).preset == "paper":
+            absolute = load_absolute(weights, config.paper)
+        grid_config = config.grid if absolute is None else absolute_grid(absolute.config, config.grid.stride_steps)
+        grid = plan_grid(detections, grid_config)
         windows = build_windows(detections, grid, config.seed, config.default_sigma_m)
-        model = fitted_model(config, detections, grid, windows, weights)
+        if absolute is None:
+            model = fitted_model(config, detections, grid, windows, weights)
+            draws, about = draw_hypotheses(model, windows, config, obstacles), _model_summary(model)
+        else:
+            draws, about = draw_absolute(absolute, windows, config.num_hypotheses, obstacles), {"preset": "paper"}
         log_id = str(detections["log_id"][0])
         parts, statuses = [], []
         with progress.bar(windows.batch.num_windows, "infer", unit="window") as bar:
-            for part, positions, weight, status in draw_hypotheses(model, windows, config, obstacles):
-                parts.append(_hypothesis_rows(log_id, windows, grid, part, positions, weight))
-                statuses.append(_window_rows(windows, part, positions, weight, status))
+            for part, positions, weight, status in draws:
+                parts.append(hypothesis_rows(log_id, windows, grid, part, positions, weight))
+                statuses.append(window_rows(windows, part, positions, weight, status))
                 bar.update(len(part))
         table = pa.concat_tables(parts)
         window_table = pa.concat_tables(statuses)
@@ -126,7 +129,7 @@ def infer(directory: Path, config: InferConfig, progress: Progress, force: bool 
             "checkpoint": config.checkpoint,
             "checkpoint_sha256": None if weights is None else checkpoint_hash(weights),
             "seed": config.seed,
-            **_model_summary(model),
+            **about,
         }
 
     return run_stage("infer", directory, config=config, inputs=inputs, body=body, force=force)
@@ -139,7 +142,7 @@ def load_model(config: InferConfig, weights: Path | None) -> GeneralModel:
     if weights is not None:
         info = read_info(weights)
         if info.preset != "general":
-            raise ConfigError(f"{weights}: a checkpoint of the {info.preset} preset; infer wants one of the general preset")
+            raise ConfigError(f"{weights}: a checkpoint of the {info.preset} preset; expected one of the general preset")
         network = ResidualNetwork(network_config(ResidualNetworkConfig, info, weights))
         load_weights(weights, network)
         network.eval().to(device)
@@ -224,62 +227,6 @@ def _draw_part(
     position = torch.full_like(position.transpose(1, 2), math.nan)
     position[active] = rows
     return position.transpose(1, 2), weight, status
-
-
-def _hypothesis_rows(
-    log_id: str, windows: MissionWindows, grid: Grid, part: Tensor, position: Tensor, weight: Tensor
-) -> pa.Table:
-    """HYPOTHESES rows of the active agents, by window, hypothesis, agent."""
-    active = windows.batch.is_active[part]
-    b, k, a, t = position.shape[:4]
-    is_row = active[:, None, :].expand(b, k, a)
-    window, hypothesis, agent = (index.numpy() for index in is_row.nonzero(as_tuple=True))
-    which = part.numpy()[window]
-    flat = pa.array(position[is_row].float().numpy().reshape(-1))
-    pairs = pa.FixedSizeListArray.from_arrays(pa.FixedSizeListArray.from_arrays(flat, 2), t)
-    num = len(window)
-    agents = pa.DictionaryArray.from_arrays(pa.array(agent.astype(np.int32)), pa.array(windows.agent_ids)).cast(pa.string())
-    columns = [
-        pa.array([log_id] * num, pa.string()),
-        pa.array(which.astype(np.int32)),
-        pa.array(windows.origins_ns[which]),
-        pa.array(np.full(num, grid.step_ns)),
-        pa.array(np.full(num, grid.origin_index, dtype=np.int32)),
-        agents,
-        pa.array(hypothesis.astype(np.int32)),
-        pa.array(weight.numpy()[window, hypothesis].astype(np.float32)),
-        pa.array(windows.datum_m[which, 0]),
-        pa.array(windows.datum_m[which, 1]),
-        pairs,
-    ]
-    schema = hypotheses_schema(t)
-    return pa.Table.from_arrays([column.cast(item.type) for column, item in zip(columns, schema, strict=True)], schema=schema)
-
-
-def _window_rows(windows: MissionWindows, part: Tensor, position: Tensor, weight: Tensor, status: list[list[str]]) -> pa.Table:
-    """WINDOWS rows of every agent."""
-    origin = position[:, :, :, windows.batch.origin_index]
-    mean = (weight[:, :, None, None] * origin).sum(1, keepdim=True)
-    spread = (weight[:, :, None] * ((origin - mean) ** 2).sum(-1)).sum(1).sqrt()
-    detections = windows.batch.detections[part]
-    age = -torch.where(detections.is_observed, detections.time_s, -torch.inf).amax(-1)
-    rows = []
-    for index, window in enumerate(part.tolist()):
-        for a, agent in enumerate(windows.agent_ids):
-            is_active = bool(detections.is_observed[index, a].any())
-            rows.append(
-                {
-                    "window": window,
-                    "origin_ns": int(windows.origins_ns[window]),
-                    "agent_id": agent,
-                    "status": status[index][a],
-                    "advice": ADVICE[status[index][a]],
-                    "num_detections": int(detections.count[index, a]),
-                    "age_s": float(age[index, a]) if is_active else None,
-                    "spread_m": float(spread[index, a]) if is_active else None,
-                }
-            )
-    return pa.Table.from_pylist(rows, schema=WINDOWS)
 
 
 def _model_summary(model: GeneralModel) -> dict[str, Any]:
