@@ -4,7 +4,7 @@ Everything is planned against two growths of the obstacles: routes must not touc
 their waypoints are corners of the `outline` (a little larger), so that rounding never decides whether a route is free.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -14,6 +14,7 @@ import shapely
 from numpy.typing import NDArray
 
 from cadence.constraints.obstacles import Obstacles
+from cadence.constraints.outlines import convex_bends, cross, grow_round, grow_sharp, loose_bends, polygon_parts
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
@@ -62,10 +63,10 @@ class Zone:
     def __init__(self, obstacles: Obstacles, growth: Growth) -> None:
         self.growth = growth
         outer = growth.margin_m + growth.clearance_m
-        self.core = _Index(_parts(_grow_round(obstacles, growth.margin_m, growth.core_sides)))
+        self.core = _Index(polygon_parts(grow_round(obstacles, growth.margin_m, growth.core_sides)))
         # The corners of round cores stick out by 1 / cos: the outline has to stay clear of them.
         stretch = 2 / np.cos(np.pi / growth.core_sides) - 1
-        self.outline = _Index(_parts(_grow_sharp(obstacles, outer, growth.outline_sides, stretch)))
+        self.outline = _Index(polygon_parts(grow_sharp(obstacles, outer, growth.outline_sides, stretch)))
         holes = [shapely.Polygon(ring) for part in self.core.shapes for ring in part.interiors]
         # Largest first, so that the innermost of nested holes names the region.
         self.holes = _Index(np.array(sorted(holes, key=lambda hole: -hole.area), dtype=object))
@@ -183,12 +184,12 @@ class Zone:
         if (part, level) not in self._known_bends:
             clearance = self.growth.clearance_m
             if level == 0:
-                bends = _joined([*_convex_bends(self.outline.shapes[part]), _loose_bends(self.outline.shapes[part], clearance)])
+                bends = _joined([*convex_bends(self.outline.shapes[part]), loose_bends(self.outline.shapes[part], clearance)])
             elif self.size(part) > 4 * clearance * 2.0**level:
-                bends = _joined(_convex_bends(self._simplified(part, level)))
+                bends = _joined(convex_bends(self._simplified(part, level)))
             else:
                 # What is small in this search is gone around by its box.
-                bends = _loose_bends(self.outline.shapes[part], clearance)[:4]
+                bends = loose_bends(self.outline.shapes[part], clearance)[:4]
             self._known_bends[part, level] = bends
         return self._known_bends[part, level]
 
@@ -345,7 +346,7 @@ def _touches_lightly(point: FloatArray, bend: FloatArray) -> NDArray[np.bool_]:
     Bends with NaN for neighbours belong to no outline and are always passed lightly.
     """
     corner = bend[..., 1, :]
-    before, after = (_cross(corner - point, bend[..., side, :] - corner) for side in (0, 2))
+    before, after = (cross(corner - point, bend[..., side, :] - corner) for side in (0, 2))
     light: NDArray[np.bool_] = ~(before * after < 0)
     return light
 
@@ -353,64 +354,11 @@ def _touches_lightly(point: FloatArray, bend: FloatArray) -> NDArray[np.bool_]:
 def _crosses(start: FloatArray, end: FloatArray, barrier: FloatArray) -> NDArray[np.bool_]:
     """Whether segments [..., 2] properly cross the barrier [2, 2]."""
     base, tip = barrier
-    sides = _cross(tip - base, start - base) * _cross(tip - base, end - base)
-    ends = _cross(end - start, base - start) * _cross(end - start, tip - start)
+    sides = cross(tip - base, start - base) * cross(tip - base, end - base)
+    ends = cross(end - start, base - start) * cross(end - start, tip - start)
     crosses: NDArray[np.bool_] = (sides < 0) & (ends < 0)
     return crosses
 
 
-def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
-    product: FloatArray = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
-    return product
-
-
-def _loose_bends(part: Any, clearance_m: float) -> FloatArray:
-    """Ten bends [10, 3, 2] around a component for tracks with few steps: four close to it, six far out."""
-    rectangle = shapely.minimum_rotated_rectangle(part)
-    angle = np.arange(6) * (np.pi / 3)
-    ring = 2 * shapely.minimum_bounding_radius(part) * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    around = shapely.get_coordinates(rectangle.buffer(clearance_m, join_style="mitre"))[:-1]
-    loose = np.concatenate([around, shapely.get_coordinates(shapely.centroid(rectangle)) + ring])
-    # What stands alone has no neighbours on an outline.
-    return np.stack([np.full_like(loose, np.nan), loose, np.full_like(loose, np.nan)], axis=1)
-
-
 def _joined(bends: Iterable[FloatArray]) -> FloatArray:
     return np.concatenate([np.full((0, 3, 2), np.nan), *bends])
-
-
-def _convex_bends(shape: Any) -> Iterator[FloatArray]:
-    for part in _parts(shape):
-        for ring in (part.exterior, *part.interiors):
-            corner = shapely.get_coordinates(ring)[:-1]
-            bends = np.stack([np.roll(corner, 1, axis=0), corner, np.roll(corner, -1, axis=0)], axis=1)
-            yield bends[_cross(corner - bends[:, 0], bends[:, 2] - corner) > 0]
-
-
-def _parts(shape: Any) -> NDArray[np.object_]:
-    """The polygons of a geometry, interiors to the left of every ring."""
-    polygons = [part for part in shapely.get_parts(shape) if part.geom_type == "Polygon" and not part.is_empty]
-    parts = np.empty(len(polygons), dtype=object)
-    parts[:] = [shapely.geometry.polygon.orient(part) for part in polygons]
-    return parts
-
-
-def _grow_round(obstacles: Obstacles, distance_m: float, sides: int) -> Any:
-    """The union of everything nearer than distance_m to an obstacle, at most a trace larger, never smaller."""
-    apothem = np.cos(np.pi / sides)
-    return shapely.union_all(
-        [*_discs(obstacles, distance_m, sides), *shapely.buffer(obstacles.shapes, distance_m / apothem, quad_segs=sides // 4)]
-    )
-
-
-def _grow_sharp(obstacles: Obstacles, distance_m: float, sides: int, stretch: float) -> Any:
-    """The same with few corners, sharp where the obstacles have corners; circles are `stretch` times as large."""
-    grown = shapely.buffer(obstacles.shapes, distance_m, join_style="mitre", mitre_limit=2.5)
-    return shapely.union_all([*_discs(obstacles, distance_m, sides, stretch), *grown])
-
-
-def _discs(obstacles: Obstacles, distance_m: float, sides: int, stretch: float = 1.0) -> list[Any]:
-    """Polygons around the circles, grown by distance_m."""
-    angle = np.arange(sides) * (2 * np.pi / sides)
-    unit = np.stack([np.cos(angle), np.sin(angle)], axis=1) / np.cos(np.pi / sides)
-    return [shapely.Polygon(row[:2] + stretch * (row[2] + distance_m) * unit) for row in obstacles.circle_array]
