@@ -90,6 +90,7 @@ def infer(directory: Path, config: InferConfig, progress: Progress, force: bool 
     weights = None if config.checkpoint == "none" else find_checkpoint(config.checkpoint)
     inputs = [directory / "detections.parquet", directory / "obstacles.json"]
     if weights is not None:
+        read_info(weights)  # names what is wrong with it more plainly than an input that is missing
         inputs += [weights, weights.with_suffix(".json")]
     for path in inputs[:1]:
         read_table(path, "detections")
@@ -154,9 +155,19 @@ def fitted_model(
 ) -> GeneralModel:
     """The model fitted to the log's detections; settings of the bank and the network's part in it chosen by hindsight."""
     sigma_m = config.default_sigma_m
+    unfitted = load_model(config, weights)
+    _check_steps(unfitted.network, grid)
     bank = fitted_bank(fit_tracks(detections, grid, sigma_m), detections, grid, windows, sigma_m)
-    model = dataclasses.replace(load_model(config, weights), bank=bank)
+    model = dataclasses.replace(unfitted, bank=bank)
     return gated(model, *_hindsight_windows(detections, grid, windows, sigma_m)) if config.is_gated else model
+
+
+def _check_steps(network: ResidualNetwork | None, grid: Grid) -> None:
+    factor = 1 if network is None else 2 ** (len(network.config.multipliers) - 1)
+    if grid.num_steps % factor:
+        raise ConfigError(
+            f"infer.grid: history_steps + horizon_steps is {grid.num_steps}; this checkpoint wants a multiple of {factor}"
+        )
 
 
 def fitted_bank(

@@ -4,6 +4,7 @@ A killed training finds its shards again; a shard is written beside its name and
 """
 
 import dataclasses
+import hashlib
 import os
 from pathlib import Path
 
@@ -20,8 +21,12 @@ _CONTEXT_FIELDS = tuple(field.name for field in dataclasses.fields(ResidualConte
 
 
 def synthetic_shard(folder: Path, config: SyntheticConfig, seed: int, index: int) -> ResidualWindows:
-    """Shard `index` of the stream that `seed` starts: read from `folder`, or made and left there."""
-    path = folder / f"synthetic-{seed}-{index:05d}.safetensors"
+    """Shard `index` of the stream that `seed` starts: read from `folder`, or made and left there.
+
+    Its name tells how it was made, so that windows of other settings are never taken for it.
+    """
+    made_by = hashlib.sha256(repr((config, SCENARIOS_PER_SHARD)).encode()).hexdigest()[:8]
+    path = folder / f"synthetic-{made_by}-{seed}-{index:05d}.safetensors"
     found = read_windows(path)
     if found is None:
         found = synthesise(config, seed * 1_000_003 + index, SCENARIOS_PER_SHARD)

@@ -45,6 +45,20 @@ class TrainConfig:
     optimiser: OptimiserConfig = field(default_factory=OptimiserConfig)
     paper: AbsoluteTraining = field(default_factory=AbsoluteTraining)
 
+    def __post_init__(self) -> None:
+        if self.batch_size < 2:
+            raise ValueError("batch_size must be at least 2")
+        counts = (self.num_shards, self.num_validation_shards, self.validate_every, self.save_every, self.optimiser.num_steps)
+        if min(counts) < 1:
+            raise ValueError(
+                "num_shards, num_validation_shards, validate_every, save_every and optimiser.num_steps must be at least 1"
+            )
+        factor = 2 ** (len(self.network.multipliers) - 1)
+        if (self.windows.history_steps + self.windows.horizon_steps) % factor:
+            raise ValueError(
+                f"windows.history_steps + windows.horizon_steps must be a multiple of {factor}, as network halves them"
+            )
+
 
 def train(out: Path, config: TrainConfig, progress: Progress, force: bool = False) -> StageResult:
     """Train into the folder `out`: checkpoint.safetensors + .json, curve.csv, curve.png, and the state to go on from.

@@ -94,14 +94,15 @@ class _LogSource:
         if len(missions) < 2:
             raise InputError(f"{config.data}: one usable log; at least two are needed, as whole logs are kept for validation")
         order = np.random.default_rng([config.seed, 1]).permutation(len(missions)).tolist()
-        num_validation = max(1, round(_VALIDATION_SHARE * len(missions)))
         parts = [mission_windows(missions[index], config, config.seed + index) for index in order]
-        held_out = [part for part in parts[:num_validation] if part is not None]
-        kept = [part for part in parts[num_validation:] if part is not None]
-        if not kept or not held_out:
+        usable = [part for part in parts if part is not None]
+        if len(usable) < 2:
             raise InputError(
-                f"{config.data}: no windows with truth at every step; use longer logs or a smaller train.windows"
+                f"{config.data}: {len(usable)} of {len(parts)} logs have windows with truth at every step, two are needed;"
+                " use longer logs or a smaller train.windows"
             )
+        num_validation = max(1, round(_VALIDATION_SHARE * len(usable)))
+        held_out, kept = usable[:num_validation], usable[num_validation:]
         self.windows, self.validation = join_windows(kept), join_windows(held_out)
 
     def batch(self, step: int, size: int, generator: torch.Generator) -> ResidualWindows:

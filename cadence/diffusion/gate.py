@@ -8,6 +8,8 @@ from cadence.diffusion.general import GateScores, GeneralModel
 from cadence.types import Detections, WindowBatch
 
 _LEAST_TESTS = 8
+_ROUNDING = 1e-5
+"""A share of the bank's score: differences below it are single precision at work, not a worse network."""
 
 
 def gated(model: GeneralModel, windows: WindowBatch, later: Detections, seed: int = 0) -> GeneralModel:
@@ -42,4 +44,5 @@ def _compare(model: GeneralModel, windows: WindowBatch, unseen: Detections) -> _
     network, bank = (hindsight_scores(estimator, windows, unseen) for estimator in (model, model.bank))
     difference = network - bank
     error = float(difference.std()) / math.sqrt(len(difference)) if len(difference) > 1 else math.inf
-    return _Comparison(float(network.mean() / bank.mean()), 0.0 if float(difference.mean()) > error else 1.0)
+    is_worse = float(difference.mean()) > error + _ROUNDING * float(bank.mean().abs())
+    return _Comparison(float(network.mean() / bank.mean()), 0.0 if is_worse else 1.0)

@@ -1,0 +1,151 @@
+"""Constraints on hypotheses: guided while drawn, repaired at the end, weighed; and drawing again by weight."""
+
+import dataclasses
+
+import pytest
+import torch
+from test_general import network
+
+from cadence.bank.bank import Bank
+from cadence.constraints.checker import segments_in_collision, states_in_collision
+from cadence.constraints.obstacles import Obstacles
+from cadence.diffusion.feasible import Feasibility, resampled
+from cadence.diffusion.general import GeneralModel
+from cadence.types import Detections, WindowBatch
+
+NUM = 8
+DATUM = torch.tensor([[1000.0, -500.0], [3000.0, 200.0]], dtype=torch.float64)
+TIMES = torch.tensor([-15.0, -14.0, -13.0, -3.0, -2.0, -1.0], dtype=torch.float64)
+
+
+def line() -> WindowBatch:
+    """Two targets that go east at one metre a second, exactly seen before and after a long gap; the second one slower."""
+    place = torch.stack([TIMES, 0.05 * TIMES**2], -1) * torch.tensor([1.0, 0.8]).double()[:, None, None]
+    covariance = torch.zeros(2, 1, 6, 2, 2, dtype=torch.float64)
+    detections = Detections(TIMES.expand(2, 1, 6), place[:, None], covariance, torch.ones(2, 1, 6, dtype=torch.bool))
+    grid = torch.arange(24, dtype=torch.float64) - 15
+    return WindowBatch(grid, detections, torch.tensor([5, 6]), 15)
+
+
+WINDOWS = line()
+BANK = Bank().fit(WINDOWS.detections, 1.0)
+MODEL = GeneralModel(BANK, network(0.2))
+POSTERIOR = BANK.posterior(WINDOWS, NUM)
+LENGTH_M = BANK.length_m(1.0)
+PINNED = (TIMES + 15).long()
+
+
+def in_the_way() -> Obstacles:
+    """A circle in each row's frame on the mean way through the gap, and one ahead."""
+    middle = POSTERIOR.mean_m[:, 8] + DATUM
+    ahead = POSTERIOR.mean_m[:, 20] + DATUM
+    radius = torch.full((2, 1), 1.0, dtype=torch.float64)
+    return Obstacles(torch.cat([torch.cat([middle, radius], 1), torch.cat([ahead, radius], 1)]))
+
+
+OBSTACLES = in_the_way()
+LIMITS = Feasibility(OBSTACLES, 0.0, None, 1.0, torch.zeros(0)).for_rows(DATUM)
+NO_LIMITS = dataclasses.replace(LIMITS, obstacles=Obstacles.none())
+
+
+def sampled(model: GeneralModel) -> torch.Tensor:
+    return model.sample(WINDOWS, NUM).position_m[:, :, 0]
+
+
+def num_inside(position: torch.Tensor) -> int:
+    return int(states_in_collision(position, OBSTACLES, offset_m=DATUM[:, None, None]).sum())
+
+
+def test_guidance_leads_out_and_repair_finishes() -> None:
+    plain, guided = sampled(MODEL), sampled(dataclasses.replace(MODEL, guide=LIMITS.guide))
+    assert num_inside(guided) < 0.5 * num_inside(plain)
+    moved, weight, is_feasible = LIMITS.finish(guided, POSTERIOR.sigma_m, LENGTH_M)
+    assert is_feasible.all() and num_inside(moved) == 0
+    assert not segments_in_collision(moved, OBSTACLES, offset_m=DATUM[:, None, None]).any()
+    assert torch.equal(moved[:, :, PINNED], guided[:, :, PINNED])
+    seen = WINDOWS.detections.position_m
+    assert (moved[:, :, PINNED] - seen).norm(dim=-1).max() < 15e-3 * LENGTH_M
+    torch.testing.assert_close(weight.sum(1), torch.ones(2, dtype=torch.float64))
+    assert weight.min() > 0
+
+
+def test_without_obstacles_guided_is_unguided() -> None:
+    plain = sampled(MODEL)
+    guided = sampled(dataclasses.replace(MODEL, guide=NO_LIMITS.guide))
+    torch.testing.assert_close(guided, plain, atol=1e-4 * LENGTH_M, rtol=1e-4)
+    moved, weight, is_feasible = NO_LIMITS.finish(plain, POSTERIOR.sigma_m, LENGTH_M)
+    assert moved is plain and is_feasible.all()
+    assert torch.equal(weight, torch.full((2, NUM), 1.0 / NUM, dtype=torch.float64))
+
+
+def test_guidance_keeps_what_is_certain_and_what_is_clear() -> None:
+    position = POSTERIOR.sample_m
+    sigma = POSTERIOR.sigma_m.clone()
+    sigma[:, 8] = 0.0
+    moved = LIMITS.guide(position, sigma, slice(0, 2))
+    assert torch.equal(moved[:, :, 8], position[:, :, 8])
+    distance, _ = OBSTACLES.signed_distance(position, offset_m=DATUM[:, None, None])
+    assert torch.equal(moved[distance > 0], position[distance > 0])
+    second = LIMITS.guide(position[1:], sigma[1:], slice(1, 2))  # each row has a datum of its own
+    assert torch.equal(second, moved[1:])
+    assert not torch.equal(LIMITS.guide(position[1:], sigma[1:], slice(0, 1)), second)
+
+
+def test_a_speed_limit_slows_down() -> None:
+    fast = dataclasses.replace(NO_LIMITS, max_speed_mps=0.5 * LENGTH_M)
+    sigma = torch.full_like(POSTERIOR.sigma_m, 100.0)
+    far = POSTERIOR.sample_m + 3.0 * torch.randn(POSTERIOR.sample_m.shape, generator=torch.Generator().manual_seed(0))
+    before, after = (torch.diff(p, dim=2).norm(dim=-1).max() for p in (far, fast.guide(far, sigma, slice(0, 2))))
+    assert after < 0.8 * before
+
+
+def test_margin_is_kept() -> None:
+    wide = dataclasses.replace(LIMITS, margin_m=0.4)
+    moved, _, is_feasible = wide.finish(sampled(MODEL), POSTERIOR.sigma_m, LENGTH_M)
+    assert is_feasible.all()
+    distance, _ = OBSTACLES.signed_distance(moved, offset_m=DATUM[:, None, None])
+    assert distance.median() > 0.4 and (distance > 0.39).double().mean() > 0.98
+
+
+def test_what_was_moved_far_counts_less_and_what_cannot_be_repaired_least() -> None:
+    still = POSTERIOR.mean_m[:1, None].expand(1, 3, -1, -1).clone()
+    still[0, :2] += torch.tensor([0.0, 40.0])  # two clear of everything, one through the circle
+    limits = LIMITS.for_rows(DATUM[:1])
+    _, weight, is_feasible = limits.finish(still, POSTERIOR.sigma_m[:1].clamp_min(0.5), LENGTH_M)
+    assert is_feasible.all() and weight[0, 0] == weight[0, 1] > weight[0, 2] > 0
+    buried = Obstacles(torch.tensor([[1000.0 + float(TIMES[1]), -500.0 + 0.05 * float(TIMES[1]) ** 2, 0.7]]).double())
+    limits = dataclasses.replace(limits, obstacles=buried)
+    _, weight, is_feasible = limits.finish(still, POSTERIOR.sigma_m[:1], LENGTH_M)
+    assert is_feasible.tolist() == [[True, True, False]]
+    assert weight[0, 2] == pytest.approx(1e-3 * float(weight[0, 0]))
+    _, weight, is_feasible = limits.finish(still[:, 2:].expand(1, 4, -1, -1).clone(), POSTERIOR.sigma_m[:1], LENGTH_M)
+    assert not is_feasible.any() and weight.tolist() == [[0.25] * 4]
+
+
+def test_drawn_again_by_weight() -> None:
+    """Systematic: every hypothesis appears floor(K w) or ceil(K w) times; rows do not disturb one another."""
+    g = torch.Generator().manual_seed(1)
+    weight = torch.rand(6, NUM, generator=g, dtype=torch.float64) ** 3
+    weight = weight / weight.sum(1, keepdim=True)
+    weight[3] = 1.0 / NUM
+    name = torch.arange(6 * NUM, dtype=torch.float64).view(6, NUM, 1, 1).expand(6, NUM, 5, 2)
+    seeds = torch.arange(6) + 40
+    out = resampled(name, weight, seeds)
+    assert torch.equal(out[3], name[3])
+    for row in range(6):
+        drawn = out[row] - row * NUM
+        assert torch.equal(drawn, drawn[:, :1, :1].expand(NUM, 5, 2))  # whole hypotheses
+        count = torch.bincount(drawn[:, 0, 0].long(), minlength=NUM)
+        expected = NUM * weight[row]
+        assert count.sum() == NUM and (count >= expected.floor() - 1e-9).all() and (count <= expected.ceil() + 1e-9).all()
+        assert torch.equal(resampled(name[row : row + 1], weight[row : row + 1], seeds[row : row + 1])[0], out[row])
+    assert torch.equal(resampled(name, weight, seeds), out)
+    assert not torch.equal(resampled(name, weight, seeds + 1), out)
+
+
+def test_weights_are_met_on_average() -> None:
+    weight = torch.tensor([[0.05, 0.15, 0.8]], dtype=torch.float64).expand(400, 3)
+    name = torch.arange(3, dtype=torch.float64).view(1, 3, 1, 1).expand(400, 3, 1, 2)
+    out = resampled(name, weight, torch.arange(400))[..., 0, 0]
+    share = torch.bincount(out.long().flatten(), minlength=3) / 1200
+    torch.testing.assert_close(share.double(), weight[0], atol=0.04, rtol=0)
