@@ -65,7 +65,7 @@ class InferConfig:
     default_sigma_m  accuracy of detections that state none
     device           "auto", "cpu" or "cuda"
     paper            how a checkpoint of the paper preset is sampled; it brings its own grid
-    is_gated         the network takes part only where, on this log, it foresees withheld detections no worse than the bank
+    is_gated         the network moves all, half or none of the hypotheses, as withheld detections of this log advise
     """
 
     num_hypotheses: int = 30
@@ -246,7 +246,7 @@ def _model_summary(model: GeneralModel) -> dict[str, Any]:
     return {
         "sampler": model.sampler,
         "num_steps": model.num_steps if model.network is not None else 0,
-        "network": {"in_past": model.strength_past > 0, "in_future": model.strength_future > 0, **ratios},
+        "network": {"share_past": model.share_past, "share_future": model.share_future, **ratios},
         "bank": {"speed_mps": bank.speed_mps, "switch_rate": bank.switch_rate, "num_models": len(bank.models)},
     }
 

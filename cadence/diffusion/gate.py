@@ -1,22 +1,26 @@
-"""The gate: the network takes part, in past and future, only where this log shows that it does not lose to the bank."""
+"""The gate: how many of the hypotheses the network moves, in the past and in the future of this log.
+
+Half and half is the safe choice: the energy score of a mixture is never worse than the mean of its parts' scores. The log
+moves it to the network or to the bank alone only where detections withheld from both show clearly that this is better.
+"""
 
 import dataclasses
 import math
+
+from torch import Tensor
 
 from cadence.bank.hindsight import hindsight_scores, num_tests, withhold
 from cadence.diffusion.general import GateScores, GeneralModel
 from cadence.types import Detections, WindowBatch
 
 _LEAST_TESTS = 8
-_ROUNDING = 1e-5
-"""A share of the bank's score: differences below it are single precision at work, not a worse network."""
+_SHARES = (0.5, 1.0, 0.0)
 
 
 def gated(model: GeneralModel, windows: WindowBatch, later: Detections, seed: int = 0) -> GeneralModel:
-    """The model with its network switched off where it clearly scores worse than the bank.
+    """The model with the network's shares chosen by hindsight.
 
-    Clearly: by more than one standard error of the difference between paired scores. The network comes from training with
-    the presumption that it helps; a handful of windows must not overturn that.
+    Clearly better means: by more than one standard error of the difference between paired scores.
 
     Args:
         model: with its bank fitted.
@@ -24,25 +28,38 @@ def gated(model: GeneralModel, windows: WindowBatch, later: Detections, seed: in
         later: detections after each window's origin.
         seed: of what is withheld.
     """
-    if model.network is None or windows.num_windows == 0:
+    if model.network is None:
         return model
-    past = _compare(model, *withhold(windows, seed))
-    future = _compare(model, windows, later)
-    scores = GateScores(past.ratio, future.ratio)
-    return dataclasses.replace(model, strength_past=past.strength, strength_future=future.strength, gate=scores)
+    untested = _Choice(_SHARES[0], None, None)
+    past = _choose(model, *withhold(windows, seed)) if windows.num_windows else untested
+    future = _choose(model, windows, later) if windows.num_windows else untested
+    scores = GateScores(past.network, past.half, future.network, future.half)
+    return dataclasses.replace(model, share_past=past.share, share_future=future.share, gate=scores)
 
 
 @dataclasses.dataclass(frozen=True)
-class _Comparison:
-    ratio: float | None
-    strength: float
+class _Choice:
+    share: float
+    network: float | None
+    half: float | None
 
 
-def _compare(model: GeneralModel, windows: WindowBatch, unseen: Detections) -> _Comparison:
+def _choose(model: GeneralModel, windows: WindowBatch, unseen: Detections) -> _Choice:
     if num_tests(windows, unseen) < _LEAST_TESTS:
-        return _Comparison(None, 1.0)
-    network, bank = (hindsight_scores(estimator, windows, unseen) for estimator in (model, model.bank))
-    difference = network - bank
+        return _Choice(_SHARES[0], None, None)
+    half, network, bank = (
+        hindsight_scores(dataclasses.replace(model, share_past=share, share_future=share), windows, unseen) for share in _SHARES
+    )
+    ratios = float(network.mean() / bank.mean()), float(half.mean() / bank.mean())
+    # the larger gain over half and half, counted in standard errors
+    gains = {1.0: _gain(half, network), 0.0: _gain(half, bank)}
+    best = max(gains, key=lambda share: gains[share])
+    return _Choice(best if gains[best] > 1.0 else _SHARES[0], *ratios)
+
+
+def _gain(half: Tensor, other: Tensor) -> float:
+    """How much better `other` scores than `half`, in standard errors of the paired difference."""
+    difference = half - other
     error = float(difference.std()) / math.sqrt(len(difference)) if len(difference) > 1 else math.inf
-    is_worse = float(difference.mean()) > error + _ROUNDING * float(bank.mean().abs())
-    return _Comparison(float(network.mean() / bank.mean()), 0.0 if is_worse else 1.0)
+    mean = float(difference.mean())
+    return mean / error if error > 0.0 else 0.0

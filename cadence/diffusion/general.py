@@ -29,13 +29,15 @@ CleanHook = Callable[[Tensor, Tensor, slice], Tensor]
 
 @dataclass(frozen=True)
 class GateScores:
-    """Energy scores of the network over the bank's on detections withheld from both; below one the network wins.
+    """Energy scores over the bank's, on detections withheld from both: of the network alone, and of half and half.
 
-    past_ratio, future_ratio  None where too little could be withheld
+    None where too little could be withheld.
     """
 
-    past_ratio: float | None
-    future_ratio: float | None
+    past_network: float | None
+    past_half: float | None
+    future_network: float | None
+    future_half: float | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +49,8 @@ class GeneralModel:
     sampler    "rotation", "ddim" or "dpmpp"
     num_steps  evaluations of the network for each hypothesis
     guide      moves clean estimates, or None
-    strength_past, strength_future  factor of the network's answer up to the origin and after it: 0 leaves the bank alone
+    share_past, share_future  share of the hypotheses that the network moves, up to the origin and after it; the others stay
+               samples of the bank
     bf16       network in bfloat16: about twice as fast where the processor knows it
     device     of the network; the bank works on the processor
     gate       what decided the strengths, or None
@@ -58,8 +61,8 @@ class GeneralModel:
     sampler: str = "rotation"
     num_steps: int = 6
     guide: CleanHook | None = None
-    strength_past: float = 1.0
-    strength_future: float = 1.0
+    share_past: float = 1.0
+    share_future: float = 1.0
     bf16: bool = False
     device: str = "cpu"
     gate: GateScores | None = None
@@ -73,7 +76,7 @@ class GeneralModel:
         """Draw hypotheses for every active agent; deterministic in the windows' seeds."""
         rows, _ = active_rows(windows)
         posterior = self.bank.posterior(windows, num_hypotheses)
-        if self.network is None or len(rows.time_s) == 0 or self.strength_past == self.strength_future == 0.0:
+        if self.network is None or len(rows.time_s) == 0 or self.share_past == self.share_future == 0.0:
             return scatter_hypotheses(posterior.sample_m, windows)
         length_m = self.bank.length_m(windows.step_s)
         context = build_context(posterior, rows, windows.time_s, windows.step_s, length_m)
@@ -101,12 +104,12 @@ class GeneralModel:
         wide = context.repeated(num_hypotheses)
         rows = slice(begin, begin + num_rows)
         mean, sigma = posterior.mean_m[rows, None], posterior.sigma_m[rows]
-        strength = self._strength(context)
+        part = self._part(num_hypotheses, context).repeat(num_rows, 1, 1)
 
         def denoise(state: Tensor, angle: float) -> Tensor:
             level = torch.full((len(state),), angle, device=state.device)
             with torch.autocast(torch.device(self.device).type, dtype=torch.bfloat16, enabled=self.bf16):
-                velocity = strength * network(state, level, wide, code).float()
+                velocity = part * network(state, level, wide, code).float()
             return clean_from("v", velocity, state, torch.tensor(angle))
 
         def guide(clean: Tensor, angle: float) -> Tensor:
@@ -121,8 +124,10 @@ class GeneralModel:
         result = _SAMPLERS[self.sampler](denoise, start, even_angles(self.num_steps), guide)
         return result.cpu().view(num_rows, num_hypotheses, -1, 2)
 
-    def _strength(self, context: ResidualContext) -> Tensor:
-        """Factor of the network's answer at every step [T, 1]; a ramp where past and future differ, so that nothing jumps."""
+    def _part(self, num_hypotheses: int, context: ResidualContext) -> Tensor:
+        """Factor of the network's answer [K, T, 1]: one for its share of the hypotheses, with a ramp at the origin."""
         steps = torch.arange(context.is_future.shape[1], device=context.mean.device) - (~context.is_future[0]).sum() + 0.5
-        share = (0.5 + steps / _RAMP_STEPS).clamp(0.0, 1.0)
-        return (self.strength_past + share * (self.strength_future - self.strength_past))[:, None]
+        later = (0.5 + steps / _RAMP_STEPS).clamp(0.0, 1.0)
+        number = torch.arange(num_hypotheses + 1, dtype=torch.float64, device=steps.device)
+        past, future = (torch.diff((number * share).floor()) for share in (self.share_past, self.share_future))
+        return (past[:, None] * (1.0 - later) + future[:, None] * later)[..., None].float()
