@@ -28,6 +28,9 @@ class ResidualNetworkConfig:
     encoder_size: int = 32
     level_size: int = 32
 
+    def __post_init__(self) -> None:
+        self.unet()  # refuses sizes that cannot be
+
     def unet(self) -> UNetConfig:
         """The U-Net these sizes mean."""
         return UNetConfig(
