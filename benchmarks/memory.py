@@ -1,7 +1,7 @@
 """How much memory does `cadence run` take on real logs?
 
 Every log is run once in a process of its own, all stages, with the shipped checkpoint; the operating system reports the peak
-of the resident memory. A bare `cadence --version` after the imports of the pipeline shows what the libraries alone take.
+of the resident memory. A process that only imports the pipeline shows what the libraries alone take.
 
     python benchmarks/memory.py --publish docs/benchmarks
 """
@@ -103,14 +103,11 @@ def main() -> int:
 
     made_with = ", ".join(f"{name} {number}" for name, number in versions().items())
     text = HEAD.format(checkpoint=f"{DEFAULT}, {checkpoint_hash(find_checkpoint(DEFAULT))}", versions=made_with)
-    text += (
-        "\n".join(lines)
-        + "\n"
-        + "".join(f"\n`{c.path}` was run with `{'`, `'.join(c.settings)}`." for c in CASES if c.settings)
-    )
-    sys.stdout.write(text + "\n")
+    text += "".join(line + "\n" for line in lines)
+    text += "".join(f"\n`{case.path}` was run with `{'`, `'.join(case.settings)}`.\n" for case in CASES if case.settings)
+    sys.stdout.write(text)
     if arguments.publish is not None:
-        write_atomic(arguments.publish / "memory.md", text + "\n")
+        write_atomic(arguments.publish / "memory.md", text)
     return 0 if holds else 1
 
 
