@@ -31,6 +31,8 @@ def synthetic_shard(folder: Path, config: SyntheticConfig, seed: int, index: int
     if found is None:
         found = synthesise(config, seed * 1_000_003 + index, SCENARIOS_PER_SHARD)
         write_windows(found, path)
+        # as it will be read: a training that was killed must not go on with other numbers than one that was not
+        found = dataclasses.replace(found, sample=found.sample.to(torch.float16).float())
     return found
 
 

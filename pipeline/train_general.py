@@ -98,8 +98,8 @@ class _LogSource:
         usable = [part for part in parts if part is not None]
         if len(usable) < 2:
             raise InputError(
-                f"{config.data}: {len(usable)} of {len(parts)} logs have windows with truth at every step, two are needed;"
-                " use longer logs or a smaller train.windows"
+                f"{config.data}: {len(usable)} of {len(parts)} logs have windows with truth at every step, two are needed; use"
+                f" longer logs, truth at least every {_MAX_GAP_STEPS:g} steps, or a smaller train.windows"
             )
         num_validation = max(1, round(_VALIDATION_SHARE * len(usable)))
         held_out, kept = usable[:num_validation], usable[num_validation:]

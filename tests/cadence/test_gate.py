@@ -1,6 +1,7 @@
-"""The gate: a bad network is switched off, a harmless one stays; and what is withheld to find out."""
+"""The gate: a bad network is switched off, a good one draws all hypotheses; and what is withheld to find out."""
 
 import dataclasses
+import math
 
 import pytest
 import torch
@@ -27,6 +28,7 @@ def later() -> Detections:
 
 
 LATER = later()
+LATER_SIGMA_M = BANK.posterior(WINDOWS, 1).sigma_m[:, [16, 20]][:, None]
 
 
 def network(bias: float, head_scale: float = 0.0) -> ResidualNetwork:
@@ -39,35 +41,49 @@ def network(bias: float, head_scale: float = 0.0) -> ResidualNetwork:
     return net
 
 
+def ratios(model: GeneralModel) -> tuple[float | None, ...]:
+    """Of network and of half and half, past before future."""
+    assert model.gate is not None
+    return dataclasses.astuple(model.gate)
+
+
 @pytest.mark.parametrize(("bias", "head_scale"), [(6.0, 0.0), (0.0, 20.0)])
 def test_a_bad_network_is_switched_off(bias: float, head_scale: float) -> None:
     found = gated(GeneralModel(BANK, network(bias, head_scale)), WINDOWS, LATER)
-    assert (found.strength_past, found.strength_future) == (0.0, 0.0)
-    assert found.gate is not None and found.gate.past_ratio is not None and found.gate.future_ratio is not None
-    assert min(found.gate.past_ratio, found.gate.future_ratio) > 1.2
+    assert (found.share_past, found.share_future) == (0.0, 0.0)
+    assert all(ratio is not None and ratio > 1.05 for ratio in ratios(found))
     assert torch.equal(found.sample(WINDOWS, 3).position_m, BANK.sample(WINDOWS, 3).position_m)
 
 
-def test_a_network_that_answers_zero_ties_and_stays() -> None:
+def test_a_network_that_knows_better_draws_them_all() -> None:
+    """The targets end up two bank sigmas from where the bank expects them; the network has learned just that."""
+    moved = dataclasses.replace(LATER, position_m=LATER.position_m + 2.0 * LATER_SIGMA_M[..., None])
+    found = gated(GeneralModel(BANK, network(-2.0 / (math.pi / 2))), WINDOWS, moved)
+    assert found.share_future == 1.0 and found.gate is not None
+    assert found.gate.future_network is not None and found.gate.future_half is not None
+    assert found.gate.future_network < found.gate.future_half < 1.0
+
+
+def test_a_network_that_answers_zero_ties() -> None:
     found = gated(GeneralModel(BANK, network(0.0)), WINDOWS, LATER)
-    assert (found.strength_past, found.strength_future) == (1.0, 1.0)
-    assert found.gate is not None
-    assert found.gate.past_ratio == pytest.approx(1.0, abs=1e-4) and found.gate.future_ratio == pytest.approx(1.0, abs=1e-4)
+    assert all(ratio == pytest.approx(1.0, abs=1e-4) for ratio in ratios(found))
+    torch.testing.assert_close(found.sample(WINDOWS, 3).position_m, BANK.sample(WINDOWS, 3).position_m, atol=1e-4, rtol=1e-4)
 
 
 def test_past_and_future_are_judged_apart() -> None:
     few = dataclasses.replace(LATER, is_observed=LATER.is_observed & (torch.arange(10) < 3)[:, None, None])
     found = gated(GeneralModel(BANK, network(6.0)), WINDOWS, few)
-    assert (found.strength_past, found.strength_future) == (0.0, 1.0)
-    assert found.gate is not None and found.gate.future_ratio is None and found.gate.past_ratio is not None
+    assert (found.share_past, found.share_future) == (0.0, 0.5)
+    assert [ratio is None for ratio in ratios(found)] == [False, False, True, True]
 
 
-def test_too_little_to_test_on_leaves_the_network_on() -> None:
+def test_with_too_little_to_test_on_it_is_half_and_half() -> None:
     bad = GeneralModel(BANK, network(6.0))
     found = gated(bad, WINDOWS[:2], LATER[:2])
-    assert (found.strength_past, found.strength_future) == (1.0, 1.0)
-    assert found.gate is not None and found.gate.past_ratio is None and found.gate.future_ratio is None
-    assert gated(bad, WINDOWS[:0], LATER[:0]) is bad
+    assert (found.share_past, found.share_future) == (0.5, 0.5)
+    assert ratios(found) == (None, None, None, None)
+    none = gated(bad, WINDOWS[:0], LATER[:0])
+    assert (none.share_past, none.share_future) == (0.5, 0.5)
     alone = GeneralModel(BANK, None)
     assert gated(alone, WINDOWS, LATER) is alone
 

@@ -1,4 +1,4 @@
-"""The general preset as an estimator: answers of zero, exact detections, seeds, neighbours, agents, strengths, guides."""
+"""The general preset as an estimator: answers of zero, exact detections, seeds, neighbours, agents, shares, guides."""
 
 import dataclasses
 import math
@@ -45,7 +45,7 @@ def in_sigmas(position: Tensor, other: Tensor, windows: WindowBatch = WINDOWS) -
 
 def test_without_a_network_the_banks_samples_are_returned() -> None:
     bank = BANK.sample(WINDOWS, NUM)
-    for model in (GeneralModel(BANK, None), dataclasses.replace(MODEL, strength_past=0.0, strength_future=0.0)):
+    for model in (GeneralModel(BANK, None), dataclasses.replace(MODEL, share_past=0.0, share_future=0.0)):
         found = model.sample(WINDOWS, NUM)
         assert torch.equal(found.position_m, bank.position_m)
         assert torch.equal(found.weight, bank.weight) and found.status == bank.status
@@ -61,24 +61,35 @@ def test_an_answer_of_zero_gives_the_bank_back(num_steps: int) -> None:
 
 @pytest.mark.parametrize("num_steps", [1, 5])
 def test_a_constant_answer_moves_by_its_integral_over_the_angle(num_steps: int) -> None:
-    """By hand: dx/dangle = c from pi/2 to 0 adds -c pi / 2, in bank sigmas, times the strength of the step."""
+    """By hand: dx/dangle = c from pi/2 to 0 adds -c pi / 2, in bank sigmas, to the hypotheses that are the network's."""
     bias = 0.4
-    model = GeneralModel(BANK, network(0.0, bias), num_steps=num_steps, strength_past=1.0, strength_future=0.25)
+    model = GeneralModel(BANK, network(0.0, bias), num_steps=num_steps, share_past=1.0, share_future=0.25)
     shift = in_sigmas(sampled(model), BANK.posterior(WINDOWS, NUM).sample_m) / (-bias * math.pi / 2)
-    strength = shift[0, 0, :, 0]
-    torch.testing.assert_close(shift, strength[:, None].expand_as(shift), atol=1e-4, rtol=0)
+    part = shift[0, :, :, 0]
+    torch.testing.assert_close(shift, part[..., None].expand_as(shift), atol=1e-4, rtol=0)
     origin = WINDOWS.origin_index
-    torch.testing.assert_close(strength[: origin - 3], torch.ones(origin - 3, dtype=torch.float64), atol=1e-4, rtol=0)
-    torch.testing.assert_close(strength[origin + 5 :], torch.full((4,), 0.25, dtype=torch.float64), atol=1e-4, rtol=0)
-    steps = torch.diff(strength)
-    assert steps.max() < 1e-4 and steps.min() > -0.75 / 8 - 1e-4  # downhill, without a jump
+    torch.testing.assert_close(part[:, : origin - 3], torch.ones(NUM, origin - 3, dtype=torch.float64), atol=1e-4, rtol=0)
+    future = part[:, origin + 5 :].round()
+    torch.testing.assert_close(part[:, origin + 5 :], future, atol=1e-4, rtol=0)
+    assert future.sum(0).tolist() == [1.0] * 4 and torch.equal(future, future[:, :1].expand_as(future))  # a quarter of four
+    steps = torch.diff(part)
+    assert steps.max() < 1e-4 and steps.min() > -1.0 / 8 - 1e-4  # downhill, without a jump
 
 
 @pytest.mark.parametrize(("past", "future", "untouched"), [(1.0, 0.0, slice(20, None)), (0.0, 1.0, slice(0, 12))])
-def test_where_the_strength_is_zero_the_bank_stays(past: float, future: float, untouched: slice) -> None:
-    model = dataclasses.replace(MODEL, strength_past=past, strength_future=future)
+def test_where_the_share_is_zero_the_bank_stays(past: float, future: float, untouched: slice) -> None:
+    model = dataclasses.replace(MODEL, share_past=past, share_future=future)
     shift = in_sigmas(sampled(model), BANK.posterior(WINDOWS, NUM).sample_m).abs()
     assert shift[:, :, untouched].max() < 1e-5 < 0.1 < shift.max()
+
+
+@pytest.mark.parametrize(("share", "num"), [(0.5, 4), (0.5, 5), (0.3, 10)])
+def test_a_share_of_the_hypotheses_is_the_networks_and_the_others_are_the_banks(share: float, num: int) -> None:
+    found = sampled(dataclasses.replace(MODEL, share_past=share, share_future=share), num=num)
+    from_bank = in_sigmas(found, BANK.posterior(WINDOWS, num).sample_m).abs().amax((0, 2, 3)) < 1e-5
+    from_network = in_sigmas(found, sampled(MODEL, num=num)).abs().amax((0, 2, 3)) < 1e-5
+    assert torch.equal(from_bank, ~from_network)
+    assert int(from_network.sum()) == math.floor(share * num)
 
 
 @pytest.mark.parametrize("sampler", ["rotation", "ddim", "dpmpp"])

@@ -169,7 +169,7 @@ def test_the_checkpoint_is_in_the_manifest_and_its_change_is_seen(tmp_path: Path
 
 def test_the_gate_is_in_the_summary(tmp_path: Path) -> None:
     directory, weights = mission(tmp_path), checkpoint(tmp_path, 30.0)
-    result = run(directory, checkpoint=str(weights))
+    result = run(directory, checkpoint=str(weights), grid=dataclasses.replace(GRID, stride_steps=5))
     about = result.summary["network"]
     assert {"share_past", "share_future", "past_network", "future_network"} <= about.keys()
     assert about["share_future"] == 0.0 and about["future_network"] > 1.0
