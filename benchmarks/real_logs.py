@@ -71,7 +71,7 @@ CASES = {
 
 def _model(data: FittingData, checkpoint: str, is_gated: bool) -> Estimator:
     config = InferConfig(checkpoint=checkpoint, is_gated=is_gated)
-    return fitted_model(config, data.detections, data.grid, data.windows, find_checkpoint(checkpoint))[0]
+    return fitted_model(config, data.detections, data.grid, data.windows, find_checkpoint(checkpoint))
 
 
 OWN = "cadence"
