@@ -71,7 +71,8 @@ class AbsoluteConfig:
 class AbsoluteSampling:
     """What belongs to a call.
 
-    sampler        "ddpm" takes all steps of the schedule, as in the paper; the others take `num_steps`
+    sampler        "ddpm" takes all steps of the schedule, as in the paper; "ddim" and "dpmpp" take fewer
+    num_steps      how many those take
     inpainting     see `cadence.diffusion.inpainting`; "overwrite" is the paper's
     length_steps, amplitude  of the smoother's kernel; the amplitude in normalised units
     floor          standard deviation added to every detection there, normalised: exact ones close in time may disagree a little
