@@ -126,7 +126,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 0
     progress = Progress(quiet=options.quiet)
     settings = [Setting(log, rate, seed) for log in options.logs for rate in options.rates for seed in options.seeds]
-    for setting in settings:
+    for setting in settings if not options.as_it_stands else ():
         run_setting(setting, options, progress)
     results = [_load(options.work, s, name, options.hypotheses) for s in settings for name in options.estimators]
     found = [result for result in results if result is not None]
@@ -135,7 +135,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if options.publish is not None:
         options.publish.mkdir(parents=True, exist_ok=True)
         command = " ".join(["python benchmarks/real_logs.py", *(sys.argv[1:] if arguments is None else arguments)])
-        command = command.replace(f" --work {options.work}", "").replace(" --quiet", "")  # these change no number
+        # these change no number, but --as-it-stands may leave seeds out: each section names its own
+        command = command.replace(f" --work {options.work}", "").replace(" --quiet", "").replace(" --as-it-stands", "")
         write_atomic(options.publish / "real_logs.md", as_markdown(rows, found, command))
         draw_chart(rows, options.publish / "real_logs.png")
     return 0
@@ -295,9 +296,11 @@ def _log_section(log: str, rows: Sequence[Row], results: Sequence[Result]) -> li
         here = [result for result in results if result.rate == rate]
         steps = sorted({result.step_s for result in here})
         windows = sorted({result.num_windows for result in here})
+        per_estimator = ({r.seed for r in here if r.estimator == name} for name in {r.estimator for r in here})
+        seeds = ", ".join(map(str, sorted(set.intersection(*per_estimator))))
         lines += [
             f"### {100 * rate:.0f} % detections", "",
-            f"Step {_span(steps)} s, {_span(windows)} windows a seed.", "",
+            f"Step {_span(steps)} s, {_span(windows)} windows a seed; seeds {seeds}.", "",
             "| part | estimator | energy m | ratio | ADE m | minADE m | mean's error | in 50 | in 90 | trajectory m | cells |",
             "| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |",
         ]  # fmt: skip
@@ -411,6 +414,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--checkpoint", default=DEFAULT, help="of cadence: a file or a shipped name (default %(default)s)")
     parser.add_argument("--hypotheses", type=int, default=30, help="joint samples a window (default %(default)s)")
     parser.add_argument("--publish", type=Path, help="write real_logs.md and real_logs.png into this folder")
+    parser.add_argument("--as-it-stands", action="store_true", help="run nothing, show and publish the results so far")
     parser.add_argument("--quiet", action="store_true")
     return parser
 
