@@ -92,48 +92,57 @@ def infer(directory: Path, config: InferConfig, progress: Progress, force: bool 
     if weights is not None:
         read_info(weights)  # names what is wrong with it more plainly than an input that is missing
         inputs += [weights, weights.with_suffix(".json")]
-    for path in inputs[:1]:
-        read_table(path, "detections")
+    detections, frame = read_table(inputs[0], "detections")
 
     def body(folder: Path) -> dict[str, Any]:
-        detections, frame = read_table(directory / "detections.parquet", "detections")
-        obstacles = read_obstacles(directory / "obstacles.json")
-        absolute = None
-        if weights is not None and read_info(weights).preset == "paper":
-            absolute = load_absolute(weights, config.paper)
-        grid_config = config.grid if absolute is None else absolute_grid(absolute.config, config.grid.stride_steps)
-        grid = plan_grid(detections, grid_config)
-        windows = build_windows(detections, grid, config.seed, config.default_sigma_m)
-        if absolute is None:
-            model = fitted_model(config, detections, grid, windows, weights)
-            draws, about = draw_hypotheses(model, windows, config, obstacles), _model_summary(model)
-        else:
-            draws, about = draw_absolute(absolute, windows, config.num_hypotheses, obstacles), {"preset": "paper"}
+        plan = _plan(config, detections, read_obstacles(inputs[1]), weights)
         log_id = str(detections["log_id"][0])
         parts, statuses = [], []
-        with progress.bar(windows.batch.num_windows, "infer", unit="window") as bar:
-            for part, positions, weight, status in draws:
-                parts.append(hypothesis_rows(log_id, windows, grid, part, positions, weight))
-                statuses.append(window_rows(windows, part, positions, weight, status))
+        with progress.bar(plan.windows.batch.num_windows, "infer", unit="window") as bar:
+            for part, positions, weight, status in plan.draws:
+                parts.append(hypothesis_rows(log_id, plan.windows, plan.grid, part, positions, weight))
+                statuses.append(window_rows(plan.windows, part, positions, weight, status))
                 bar.update(len(part))
-        table = pa.concat_tables(parts)
-        window_table = pa.concat_tables(statuses)
-        write_table(table, folder / "hypotheses.parquet", "hypotheses", frame)
-        write_table(window_table, folder / "windows.parquet", "windows", frame)
-        counts = window_table["status"].value_counts().to_pylist()
+        tracks, windows = pa.concat_tables(parts), pa.concat_tables(statuses)
+        write_table(tracks, folder / "hypotheses.parquet", "hypotheses", frame)
+        write_table(windows, folder / "windows.parquet", "windows", frame)
+        counts = windows["status"].value_counts().to_pylist()
         return {
-            "num_windows": windows.batch.num_windows,
-            "num_agents": len(windows.agent_ids),
-            "num_tracks": table.num_rows,
+            "num_windows": plan.windows.batch.num_windows,
+            "num_agents": len(plan.windows.agent_ids),
+            "num_tracks": tracks.num_rows,
             "status": {str(item["values"]): int(item["counts"]) for item in counts},
-            "step_s": grid.step_s,
+            "step_s": plan.grid.step_s,
             "checkpoint": config.checkpoint,
             "checkpoint_sha256": None if weights is None else checkpoint_hash(weights),
             "seed": config.seed,
-            **about,
+            **plan.about,
         }
 
     return run_stage("infer", directory, config=config, inputs=inputs, body=body, force=force)
+
+
+@dataclass(frozen=True, eq=False)
+class _Plan:
+    """What is to be drawn: the windows, the draws as they come, and what the summary says of the model."""
+
+    grid: Grid
+    windows: MissionWindows
+    draws: Iterator[tuple[Tensor, Tensor, Tensor, list[list[str]]]]
+    about: dict[str, Any]
+
+
+def _plan(config: InferConfig, detections: pa.Table, obstacles: Obstacles, weights: Path | None) -> _Plan:
+    """The draws by the preset of the checkpoint, which decides the grid as well."""
+    if weights is not None and read_info(weights).preset == "paper":
+        paper = load_absolute(weights, config.paper)
+        grid = plan_grid(detections, absolute_grid(paper.config, config.grid.stride_steps))
+        windows = build_windows(detections, grid, config.seed, config.default_sigma_m)
+        return _Plan(grid, windows, draw_absolute(paper, windows, config.num_hypotheses, obstacles), {"preset": "paper"})
+    grid = plan_grid(detections, config.grid)
+    windows = build_windows(detections, grid, config.seed, config.default_sigma_m)
+    model = fitted_model(config, detections, grid, windows, weights)
+    return _Plan(grid, windows, draw_hypotheses(model, windows, config, obstacles), _model_summary(model))
 
 
 def load_model(config: InferConfig, weights: Path | None) -> GeneralModel:
