@@ -17,11 +17,12 @@ import torch
 from torch import Tensor
 
 from cadence.bank.rows import active_rows
-from cadence.diffusion.absolute import AbsoluteModel, AbsoluteSampling, Placement
+from cadence.diffusion.absolute import AbsoluteModel, AbsoluteSampling
 from cadence.diffusion.inpainting import grid_detections, known_cells
 from cadence.metrics import bootstrap_mean
 from cadence.network.trajectory import TrajectoryNetworkConfig
 from cadence.training.loop import OptimiserConfig
+from cadence.types import Context
 from cadence.worlds.patrol import PatrolConfig, simulate_patrol
 from pipeline.absolute import load_absolute
 from pipeline.manifest import write_atomic
@@ -92,7 +93,7 @@ def test_windows(model: AbsoluteModel, num_episodes: int) -> Test:
 def sampled(test: Test, sampling: AbsoluteSampling, num_hypotheses: int) -> Tensor:
     """Hypotheses [B, K, T, 2] of all test windows."""
     model = dataclasses.replace(test.model, sampling=sampling)
-    parts = [model.located(Placement(datum)).sample(batch, num_hypotheses).position_m[:, :, 0] for batch, datum in test.batches]
+    parts = [model.placed(Context(datum)).sample(batch, num_hypotheses).position_m[:, :, 0] for batch, datum in test.batches]
     return torch.cat(parts)
 
 

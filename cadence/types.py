@@ -100,6 +100,37 @@ class WindowBatch:
 
 
 @dataclass(frozen=True, eq=False)
+class Context:
+    """What is known of B windows beside the detections; estimators that learned a place need it.
+
+    datum_m       [B, 2] float64: what window positions are relative to, in the mission frame
+    elapsed_s     [B] seconds from the beginning of the mission to the window origin
+    known_goal_m  [B, A, 2] a goal that the searching side knows of, in the mission frame; NaN: none known
+    tracker_m     [B, H, M, 2] positions of M moving trackers at the last H steps up to the origin, oldest first, in the
+                  mission frame; NaN: absent
+    """
+
+    datum_m: Tensor
+    elapsed_s: Tensor | None = None
+    known_goal_m: Tensor | None = None
+    tracker_m: Tensor | None = None
+
+    def __post_init__(self) -> None:
+        b = len(self.datum_m)
+        if self.datum_m.shape != (b, 2):
+            raise ValueError(f"Context.datum_m has shape {tuple(self.datum_m.shape)}, expected [B, 2]")
+        for name, ndim in (("elapsed_s", 1), ("known_goal_m", 3), ("tracker_m", 4)):
+            value = getattr(self, name)
+            if value is not None and (value.ndim != ndim or len(value) != b):
+                raise ValueError(f"Context.{name} has shape {tuple(value.shape)}, expected {ndim} axes, {b} windows first")
+
+    def __getitem__(self, windows: slice | Tensor) -> "Context":
+        """The same for a selection of windows."""
+        given = {name: value[windows] for name, value in vars(self).items() if value is not None}
+        return Context(**given)
+
+
+@dataclass(frozen=True, eq=False)
 class HypothesisSet:
     """Weighted joint hypotheses.
 

@@ -7,9 +7,10 @@ import torch
 from torch import Tensor
 
 from cadence.constraints.obstacles import Obstacles
-from cadence.diffusion.absolute import AbsoluteConfig, AbsoluteModel, AbsoluteSampling, Placement
+from cadence.diffusion.absolute import AbsoluteConfig, AbsoluteModel, AbsoluteSampling
 from cadence.errors import ConfigError
 from cadence.network.trajectory import TrajectoryNetwork
+from cadence.types import Context
 from pipeline.checkpoints import load_weights, network_config, read_info
 from pipeline.windows import GridConfig, MissionWindows
 
@@ -35,7 +36,7 @@ def absolute_grid(config: AbsoluteConfig, stride_steps: int = 16) -> GridConfig:
 
 def placed(model: AbsoluteModel, windows: MissionWindows, obstacles: Obstacles | None = None) -> AbsoluteModel:
     """The model for the windows of one mission."""
-    return model.located(Placement(torch.from_numpy(windows.datum_m)), obstacles)
+    return model.placed(Context(torch.from_numpy(windows.datum_m)), obstacles)
 
 
 def draw_absolute(
@@ -44,6 +45,6 @@ def draw_absolute(
     """Windows in chunks: their indices, positions [B', K, A, T, 2] about the datum, weights [B', K], status [B'][A]."""
     for begin in range(0, windows.batch.num_windows, _WINDOWS_AT_ONCE):
         part = torch.arange(begin, min(begin + _WINDOWS_AT_ONCE, windows.batch.num_windows))
-        here = model.located(Placement(torch.from_numpy(windows.datum_m)[part]), obstacles)
+        here = model.placed(Context(torch.from_numpy(windows.datum_m)[part]), obstacles)
         drawn = here.sample(windows.batch[part], num_hypotheses)
         yield part, drawn.position_m.double(), drawn.weight.double(), [list(row) for row in drawn.status]

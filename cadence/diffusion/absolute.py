@@ -31,7 +31,7 @@ from cadence.diffusion.inpainting import (
 from cadence.diffusion.sampler import Hook, sample_ddim, sample_ddpm, sample_dpmpp_2m
 from cadence.errors import ConfigError
 from cadence.network.trajectory import TrajectoryNetwork, TrajectoryNetworkConfig
-from cadence.types import Detections, HypothesisSet, WindowBatch
+from cadence.types import Context, Detections, HypothesisSet, WindowBatch
 
 
 @dataclass(frozen=True)
@@ -110,32 +110,18 @@ PAPER_SAMPLING = AbsoluteSampling(inpainting="overwrite", guidance="paper")
 
 
 @dataclass(frozen=True, eq=False)
-class Placement:
-    """Where B windows lie in the mission frame.
-
-    datum_m [B, 2] what window positions are relative to
-    goal_m  [B, A, 2] known goals in the mission frame, for networks that want them
-    elapsed [B] share of the longest mission that has passed, likewise
-    """
-
-    datum_m: Tensor
-    goal_m: Tensor | None = None
-    elapsed: Tensor | None = None
-
-
-@dataclass(frozen=True, eq=False)
 class AbsoluteModel:
     """A trained network as an `Estimator`.
 
     It fills every step of its grid (`config.history_steps`, `config.horizon_steps`) and takes no other. Agents without
-    detections are NaN. `obstacles` lie in the mission frame; `placement` is needed unless the model is relative and
-    unguided (`located`).
+    detections are NaN. `obstacles` lie in the mission frame; `context` is needed unless the model is relative and
+    unguided (`placed`).
     """
 
     network: TrajectoryNetwork
     config: AbsoluteConfig
     sampling: AbsoluteSampling = field(default_factory=AbsoluteSampling)
-    placement: Placement | None = None
+    context: Context | None = None
     obstacles: Obstacles = field(default_factory=Obstacles.none)
     name: str = "absolute"
 
@@ -143,9 +129,9 @@ class AbsoluteModel:
         """The model itself: it adapts to nothing."""
         return self
 
-    def located(self, placement: Placement, obstacles: Obstacles | None = None) -> "AbsoluteModel":
+    def placed(self, context: Context, obstacles: Obstacles | None = None) -> "AbsoluteModel":
         """The model for the windows of one mission."""
-        return dataclasses.replace(self, placement=placement, obstacles=obstacles or self.obstacles)
+        return dataclasses.replace(self, context=context, obstacles=obstacles or self.obstacles)
 
     @torch.no_grad()
     def sample(self, windows: WindowBatch, num_hypotheses: int) -> HypothesisSet:
@@ -169,16 +155,16 @@ class AbsoluteModel:
                 f"infer.grid: this checkpoint predicts {config.network.num_steps} steps of {config.step_s:g} s only; set "
                 f"step_s = {config.step_s:g}, history_steps = {config.history_steps}, horizon_steps = {config.horizon_steps}"
             )
-        if self.placement is not None and len(self.placement.datum_m) != windows.num_windows:
-            raise ValueError(f"AbsoluteModel: a placement of {len(self.placement.datum_m)} windows for {windows.num_windows}")
-        if self.placement is None and not (self.config.relative and self.sampling.guidance == "none"):
-            raise ValueError("AbsoluteModel: the windows have no place in the mission frame; use located()")
+        if self.context is not None and len(self.context.datum_m) != windows.num_windows:
+            raise ValueError(f"AbsoluteModel: a context of {len(self.context.datum_m)} windows for {windows.num_windows}")
+        if self.context is None and not (self.config.relative and self.sampling.guidance == "none"):
+            raise ValueError("AbsoluteModel: the windows have no place in the mission frame; use placed()")
 
     def _frame(self, nodes: Nodes, window: Tensor, agent: Tensor) -> "_Frame":
         rows = torch.arange(len(window))
         datum = torch.zeros(len(window), 2, dtype=torch.float64)
-        if self.placement is not None:
-            datum = self.placement.datum_m.double()[window]
+        if self.context is not None:
+            datum = self.context.datum_m.double()[window]
         centre = torch.tensor(self.config.centre_m, dtype=torch.float64) - datum
         if self.config.relative:
             centre = nodes.position_m[rows, nodes.is_observed.sum(dim=1) - 1]
@@ -187,18 +173,18 @@ class AbsoluteModel:
 
     def _extra(self, window: Tensor, agent: Tensor, centre_m: Tensor) -> Tensor | None:
         """Further inputs [R, 1, E], as far as the network has them."""
-        network, placement = self.config.network, self.placement
+        network, context = self.config.network, self.context
         columns = []
         if network.known_goal:
-            if placement is None or placement.goal_m is None:
+            if context is None or context.known_goal_m is None:
                 raise ConfigError(
                     "this checkpoint wants to know the goal, and none is given; use one trained without known_goal"
                 )
-            columns.append((placement.goal_m.double()[window, agent] - centre_m) / self.config.scale_m)
+            columns.append((context.known_goal_m.double()[window, agent] - centre_m) / self.config.scale_m)
         if network.elapsed:
-            if placement is None or placement.elapsed is None:
+            if context is None or context.elapsed_s is None:
                 raise ConfigError("this checkpoint wants the elapsed share, and none is given; use one trained without elapsed")
-            columns.append(placement.elapsed.double()[window, None])
+            columns.append(context.elapsed_s.double()[window, None] / (self.config.step_s * self.config.age_scale_steps))
         return torch.cat(columns, dim=-1)[:, None].float() if columns else None
 
     def _sample_rows(self, frame: "_Frame", stream: "_RowNoise", num_hypotheses: int) -> Tensor:

@@ -12,13 +12,12 @@ from cadence.diffusion.absolute import (
     AbsoluteConfig,
     AbsoluteModel,
     AbsoluteSampling,
-    Placement,
     detection_rows,
 )
 from cadence.errors import ConfigError
 from cadence.network.trajectory import TrajectoryNetwork, TrajectoryNetworkConfig
 from cadence.training.absolute import AbsoluteWindows, absolute_loss, join_absolute
-from cadence.types import Detections, WindowBatch
+from cadence.types import Context, Detections, WindowBatch
 
 NETWORK = TrajectoryNetworkConfig(
     num_steps=16, num_levels=12, width=16, multipliers=(1, 2), num_blocks=1, encoder_size=16, level_size=16
@@ -45,8 +44,8 @@ def model(sampling=FAST, config=CONFIG, b=3, **changes):
     with torch.no_grad():
         for parameter in network.parameters():
             parameter.copy_(0.1 * torch.randn(parameter.shape, generator=generator))
-    placement = Placement(torch.tensor([[120.0, 40.0]]).double().expand(b, 2))
-    return AbsoluteModel(network.eval(), config, sampling, placement, **changes)
+    context = Context(torch.tensor([[120.0, 40.0]]).double().expand(b, 2))
+    return AbsoluteModel(network.eval(), config, sampling, context, **changes)
 
 
 def test_shapes_status_and_inactive_agents():
@@ -160,13 +159,13 @@ def test_absolute_networks_know_the_map_and_relative_ones_do_not():
     shift = torch.tensor([300.0, -50.0]).double()
     seen = dataclasses.replace(windows.detections, position_m=windows.detections.position_m - shift)
     elsewhere = dataclasses.replace(windows, detections=seen)
-    datum = Placement(torch.tensor([[120.0, 40.0]]).double().expand(3, 2) + shift)
+    datum = Context(torch.tensor([[120.0, 40.0]]).double().expand(3, 2) + shift)
     found = model().sample(windows, 3).position_m
     torch.testing.assert_close(
-        model().located(datum).sample(elsewhere, 3).position_m + shift, found, equal_nan=True, rtol=0, atol=2e-3
+        model().placed(datum).sample(elsewhere, 3).position_m + shift, found, equal_nan=True, rtol=0, atol=2e-3
     )
     assert not torch.allclose(model().sample(elsewhere, 3).position_m[0] + shift, found[0], atol=1.0)
-    relative = dataclasses.replace(model(config=dataclasses.replace(CONFIG, relative=True)), placement=None)
+    relative = dataclasses.replace(model(config=dataclasses.replace(CONFIG, relative=True)), context=None)
     torch.testing.assert_close(
         relative.sample(elsewhere, 3).position_m + shift, relative.sample(windows, 3).position_m,
         equal_nan=True, rtol=0, atol=2e-3,
@@ -178,12 +177,12 @@ def test_goal_and_elapsed_reach_the_network():
     windows, estimator = batch(), model(config=config)
     with pytest.raises(ConfigError, match="goal"):
         estimator.sample(windows, 2)
-    placement = dataclasses.replace(estimator.placement, goal_m=torch.zeros(3, 2, 2).double(), elapsed=torch.zeros(3))
-    near = estimator.located(placement).sample(windows, 2).position_m
-    later = dataclasses.replace(placement, elapsed=torch.ones(3))
-    there = dataclasses.replace(placement, goal_m=torch.full((3, 2, 2), 90.0).double())
+    context = dataclasses.replace(estimator.context, known_goal_m=torch.zeros(3, 2, 2).double(), elapsed_s=torch.zeros(3))
+    near = estimator.placed(context).sample(windows, 2).position_m
+    later = dataclasses.replace(context, elapsed_s=torch.full((3,), 1e4))
+    there = dataclasses.replace(context, known_goal_m=torch.full((3, 2, 2), 90.0).double())
     for other in (later, there):
-        assert not torch.allclose(estimator.located(other).sample(windows, 2).position_m[0], near[0], atol=0.01)
+        assert not torch.allclose(estimator.placed(other).sample(windows, 2).position_m[0], near[0], atol=0.01)
 
 
 def test_what_does_not_fit_is_refused():
@@ -191,9 +190,9 @@ def test_what_does_not_fit_is_refused():
         model().sample(batch(origin=4), 2)
     with pytest.raises(ConfigError, match="step_s = 2"):
         model().sample(dataclasses.replace(batch(), time_s=batch().time_s * 2), 2)
-    with pytest.raises(ValueError, match="located"):
-        dataclasses.replace(model(), placement=None).sample(batch(), 2)
-    with pytest.raises(ValueError, match="placement of 1"):
+    with pytest.raises(ValueError, match="placed"):
+        dataclasses.replace(model(), context=None).sample(batch(), 2)
+    with pytest.raises(ValueError, match="context of 1"):
         model(b=1).sample(batch(), 2)
     with pytest.raises(ValueError, match="ddpm"):
         AbsoluteSampling("ddim", guidance="paper")
@@ -251,7 +250,7 @@ def test_one_batch_is_learned_by_heart():
         optimiser.step()
         losses.append(float(loss.detach()))
     assert sum(losses[-20:]) / 20 < 0.1 * losses[0]
-    centre = Placement(torch.tensor([[100.0, 50.0]]).double().expand(8, 2))
+    centre = Context(torch.tensor([[100.0, 50.0]]).double().expand(8, 2))
     truth = windows.clean.double() * CONFIG.scale_m
     for sampling in (
         AbsoluteSampling("dpmpp", 8, "none"),
