@@ -1,0 +1,333 @@
+"""How the searching side of the paper's two worlds moves: parties and helicopters on land, vessels and aeroplanes at sea.
+
+The policy is that of the authors' simulators (BlueHeuristic and MovingObject; read for facts, written anew for batches).
+Every mover holds a plan and follows it until the next detection:
+
+* at first it goes to a random point;
+* the first detection sends everybody to where the target was;
+* every later one gives the target's speed and heading from the last two detections, and each mover plans to cut its way off:
+  it goes to the foot of the perpendicular from itself to the target's line, and from there along the line, towards the
+  target where it gets there first, after it where the target does; a mover that is behind goes to where the target was and
+  on after it; one whose foot is off the map goes to the point of the map next to it; one that could be there in a step goes;
+* along the line it is fast until the target should be near (30 units behind, 200 ahead), then slow (22 behind, 8 ahead);
+* after a point without a line it flies a square spiral, then goes to a random point, and so on.
+
+Aircraft work in cycles: 200 steps in the air, 40 on the ground, where they keep their plan, hear no command, and still
+see. As in the original, a spiral on land is flown only after a further random point, except near a mountain: the mover
+goes away, comes back, and searches then (the recorded motion of the authors' simulator shows it).
+
+Decided here, where the original does something that cannot be meant: the side on which a mover is, is taken from the whole
+direction and not from its x component; destinations that are not allowed are drawn anew when they are planned and not when
+they are approached; a line that runs into land ends there, as it does at the map's edge.
+
+Units are the world's (cells or kilometres) and steps.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cadence.worlds.draws import Array, Draws, Indices
+
+Mask = NDArray[np.bool_]
+
+STEPS_ON, STEPS_OFF = 200, 40
+ARRIVED = 10.0
+"""A mover this near to a point has reached it."""
+
+SPIRAL_SPEED, CHASE_SPEED, MEET_SPEED = 30.0, 22.0, 8.0
+_CHASE_GAP, _MEET_GAP = 30.0, 200.0
+_SPIRAL_UNIT = 44.0
+_STREAM_START, _STREAM_RANDOM, _STREAM_NEAR = 1, 2, 3
+_SCATTER = 200.0
+
+_GO, _SPIRAL, _LINE, _NOTHING = range(4)
+
+
+def _spiral_offsets() -> Array:
+    """Corners [14, 2] of the square spiral relative to its middle: sides of 1, 1, 2, 2 ... 7, 7 units."""
+    sides = np.repeat(np.arange(1, 8), 2)
+    turns = np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])[np.arange(14) % 4]
+    offsets: Array = np.cumsum(turns * sides[:, None] * _SPIRAL_UNIT, axis=0)
+    return offsets
+
+
+_OFFSETS = _spiral_offsets()
+
+
+@dataclass(frozen=True)
+class MoverKind:
+    """A kind of searcher: its name, top speed a step, sensor factor k, and whether it works in cycles."""
+
+    name: str
+    speed: float
+    sensitivity: float
+    is_cyclic: bool = False
+
+
+PARTY = MoverKind("party", 6.5, 0.75)
+HELICOPTER = MoverKind("helicopter", 127.0, 0.5, is_cyclic=True)
+VESSEL = MoverKind("vessel", 6.5, 0.75)
+AIRPLANE = MoverKind("airplane", 127.0, 2.0, is_cyclic=True)
+
+
+class Ground(Protocol):
+    """What a world tells its searchers; all points are [N, 2]."""
+
+    size: Array
+    detours_before_spiral: bool
+    acts_on_arrival: bool
+
+    def snap(self, point: Array) -> Array:
+        """The nearest point at which something can stand (whole cells)."""
+        ...
+
+    def is_outside(self, point: Array) -> Mask:
+        """Where plans may not lead because it is off the map."""
+        ...
+
+    def is_closed(self, point: Array) -> Mask:
+        """Where plans may not lead because of an obstacle."""
+        ...
+
+    def ends_spiral(self, point: Array) -> Mask:
+        """Corners at which a spiral breaks off."""
+        ...
+
+    def ends_line(self, point: Array, speed: Array) -> Mask:
+        """Where a mover on a line has come to its end."""
+        ...
+
+    def is_near_obstacle(self, point: Array) -> Mask:
+        """Where a spiral begins at once though others make a detour first."""
+        ...
+
+    def settle(self, point: Array, heading: Array, otherwise: Array) -> Array:
+        """A foot of the perpendicular, moved along the heading to where it is allowed."""
+        ...
+
+    def aim(self, position: Array, goal: Array) -> Array:
+        """The point to make for now on the way to the goal."""
+        ...
+
+    def move(self, position: Array, direction: Array, speed: Array) -> Array:
+        """Where a mover gets in one step."""
+        ...
+
+
+def is_working(kind: MoverKind, step: int) -> bool:
+    """Whether movers of this kind are on the move at a step."""
+    return not kind.is_cyclic or step % (STEPS_ON + STEPS_OFF) < STEPS_ON
+
+
+class Pursuit:
+    """The movers of a batch of episodes: their positions and plans, as flat arrays of N = B * M movers.
+
+    `position` [B, M, 2] holds where they are. At every step call `notice` with what was detected at the step before, then
+    `advance`. Everything drawn depends on (seed, episode, step, mover) only.
+    """
+
+    def __init__(self, ground: Ground, kinds: Sequence[MoverKind], draws: Draws) -> None:
+        num_episodes, num_movers = len(draws), len(kinds)
+        count = num_episodes * num_movers
+        self.kinds = tuple(kinds)
+        self._ground, self._draws = ground, draws
+        self._shape = (num_episodes, num_movers)
+        self._row = np.repeat(np.arange(num_episodes), num_movers)
+        self._mover = np.tile(np.arange(num_movers), num_episodes)
+        self._speed = np.tile([kind.speed for kind in kinds], num_episodes)
+        self._leg = np.full(count, _GO, dtype=np.int8)
+        self._after = np.full(count, _NOTHING, dtype=np.int8)
+        self._goal = np.zeros((count, 2))
+        self._middle = np.zeros((count, 2))
+        self._corner = np.zeros(count, dtype=np.int64)
+        self._num_corners = np.zeros(count, dtype=np.int64)
+        self._heading = np.zeros((count, 2))
+        self._fast_steps = np.zeros(count)
+        self._slow_speed = np.zeros(count)
+        self._seen = np.full((num_episodes, 2), np.nan)
+        self._seen_step = np.full(num_episodes, -1)
+        everybody = np.arange(count)
+        self._position = self._open_point(everybody, 0, _STREAM_START)
+        self._go_random(everybody, 0)
+
+    @property
+    def position(self) -> Array:
+        """Where the movers are [B, M, 2]; a view that `advance` changes."""
+        return self._position.reshape(*self._shape, 2)
+
+    def notice(self, step: int, is_detected: Mask, target: Array) -> None:
+        """Tell the movers what was detected at `step`: in which episodes [B], and the target's position there [B, 2]."""
+        if not is_detected.any():
+            return
+        is_first = is_detected & (self._seen_step < 0)
+        commands = self._listening(is_detected & ~is_first, step)
+        if len(commands):
+            row = self._row[commands]
+            way = target[row] - self._seen[row]
+            self._intercept(commands, step, target[row], way, step - self._seen_step[row])
+        commands = self._listening(is_first, step)
+        self._go(commands, target[self._row[commands]], _NOTHING, step)
+        self._seen[is_detected] = target[is_detected]
+        self._seen_step[is_detected] = step
+
+    def advance(self, step: int, is_running: Mask) -> None:
+        """Move from `step` - 1 to `step` in the episodes [B] that go on."""
+        movers = self._listening(is_running, step - 1)
+        if self._ground.acts_on_arrival:
+            for _ in range(3):  # the next leg may end here, too
+                self._finish_legs(movers, step)
+        direction, speed = self._steer(movers)
+        self._fast_steps[movers[self._leg[movers] == _LINE]] -= 1
+        if not self._ground.acts_on_arrival:
+            self._finish_legs(movers, step)
+        moves = np.array([is_working(kind, step) for kind in self.kinds])[self._mover[movers]]
+        moving = movers[moves]
+        self._position[moving] = self._ground.move(self._position[moving], direction[moves], speed[moves])
+
+    def _listening(self, episodes: Mask, step: int) -> Indices:
+        """Indices of the movers of these episodes that work at a step."""
+        works = np.array([is_working(kind, step) for kind in self.kinds])
+        return np.flatnonzero((episodes[:, None] & works).ravel())
+
+    def _steer(self, movers: Indices) -> tuple[Array, Array]:
+        """Unit directions [n, 2] and speeds [n] that the plans ask for."""
+        leg, here = self._leg[movers], self._position[movers]
+        is_line = leg == _LINE
+        direction = self._heading[movers].copy()
+        is_fast = self._fast_steps[movers] > 0
+        speed = np.where(is_line & ~is_fast, self._slow_speed[movers], self._speed[movers])
+        speed = np.where(leg == _SPIRAL, SPIRAL_SPEED, speed)
+        points = np.flatnonzero(~is_line)
+        way = self._ground.aim(here[points], self._goal[movers[points]]) - here[points]
+        distance = np.sqrt((way * way).sum(axis=-1))
+        direction[points] = way / np.where(distance > 0, distance, 1.0)[:, None]
+        speed[points] = np.minimum(speed[points], distance)
+        return direction, np.minimum(speed, self._speed[movers])
+
+    def _finish_legs(self, movers: Indices, step: int) -> None:
+        """Take the next leg where one is finished."""
+        leg, here = self._leg[movers], self._position[movers]
+        way = self._goal[movers] - here
+        there = (way * way).sum(axis=-1) <= ARRIVED * ARRIVED
+        is_line = leg == _LINE
+        spent = is_line.copy()
+        lines = np.flatnonzero(is_line)
+        spent[lines] = self._ground.ends_line(here[lines], self._speed[movers[lines]])
+        after = self._after[movers]
+        arrived = there & (leg == _GO)
+        self._leg[movers[arrived & (after == _LINE)]] = _LINE
+        self._go_corner(movers[arrived & (after == _SPIRAL)], step)
+        cornered = movers[there & (leg == _SPIRAL)]
+        self._corner[cornered] += 1
+        is_last = self._corner[cornered] >= self._num_corners[cornered]
+        self._go_corner(cornered[~is_last], step)
+        self._plan_spiral(movers[arrived & (after == _NOTHING)], step)
+        self._go_random(np.concatenate([cornered[is_last], movers[spent]]), step)
+
+    def _go(self, movers: Indices, goal: Array, after: int, step: int) -> None:
+        """Plan to go to a point, or near it where it is not allowed, and then what `after` says."""
+        self._leg[movers], self._after[movers] = _GO, after
+        self._goal[movers] = self._allowed(movers, goal, step)
+
+    def _go_random(self, movers: Indices, step: int) -> None:
+        if len(movers):
+            self._leg[movers], self._after[movers] = _GO, _NOTHING
+            self._goal[movers] = self._open_point(movers, step, _STREAM_RANDOM)
+
+    def _plan_spiral(self, movers: Indices, step: int) -> None:
+        """A spiral around where the movers are, after a random point where that is the custom."""
+        if not len(movers):
+            return
+        here = self._position[movers]
+        corners = here[:, None] + _OFFSETS
+        ends = self._ground.ends_spiral(corners.reshape(-1, 2)).reshape(len(movers), -1)
+        count = np.where(ends.any(axis=1), ends.argmax(axis=1), len(_OFFSETS))
+        self._middle[movers], self._corner[movers], self._num_corners[movers] = here, 0, count
+        away = count == 0
+        if self._ground.detours_before_spiral:
+            away |= ~self._ground.is_near_obstacle(here)
+        self._go_random(movers[away], step)
+        self._after[movers[away & (count > 0)]] = _SPIRAL
+        self._go_corner(movers[~away], step)
+
+    def _go_corner(self, movers: Indices, step: int) -> None:
+        """Make for the next corner of the spiral, or for a point near it where it is not allowed."""
+        if not len(movers):
+            return
+        # A closed corner is replaced by a plain way-point; the spiral goes on behind it.
+        goal = self._middle[movers] + _OFFSETS[self._corner[movers]]
+        closed = self._ground.is_closed(goal)
+        self._leg[movers] = _SPIRAL
+        self._goal[movers] = goal
+        if closed.any():
+            off = movers[closed]
+            self._corner[off] += 1
+            is_last = self._corner[off] >= self._num_corners[off]
+            self._go(off[is_last], goal[closed][is_last], _NOTHING, step)
+            self._go(off[~is_last], goal[closed][~is_last], _SPIRAL, step)
+
+    def _intercept(self, movers: Indices, step: int, target: Array, way: Array, steps: Array) -> None:
+        """Plan to cut off a target [n, 2] that came `way` [n, 2] in `steps` [n]."""
+        ground, here, top = self._ground, self._position[movers], self._speed[movers]
+        length = np.sqrt((way * way).sum(axis=-1))
+        heading = np.where(length[:, None] > 0, way / np.where(length > 0, length, 1.0)[:, None], [1.0, 0.0])
+        speed = length / steps
+        along = ((here - target) * heading).sum(axis=-1)
+        foot = ground.snap(target + along[:, None] * heading)
+        distance = np.hypot(*(here - target).T)
+        to_foot = np.hypot(*(foot - here).T)
+        from_target = np.hypot(*(foot - target).T)
+        beside = distance < top
+        ahead = ~beside & (along > 0)
+        outside = ahead & ground.is_outside(foot)
+        on_line = ahead & ~outside
+        behind = ~beside & ~ahead
+        time = to_foot / top
+        meets = on_line & (from_target >= speed * time)
+        foot[on_line] = ground.settle(foot[on_line], heading[on_line], target[on_line])
+        goal = np.where(on_line[:, None], foot, target)
+        goal[outside] = np.clip(foot[outside], 1.0, ground.size - 2.0)
+        gap = np.where(behind, speed * distance / top, np.abs(speed * time - from_target))
+        gap -= np.where(meets, _MEET_GAP, _CHASE_GAP)
+        closing = np.where(meets, top + speed, top - speed)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            fast = gap / closing
+        self._heading[movers] = np.where(meets[:, None], -heading, heading)
+        self._fast_steps[movers] = np.where(fast > 1.0, fast - 1.0, 0.0)
+        self._slow_speed[movers] = np.where(meets, MEET_SPEED, CHASE_SPEED)
+        self._go(movers, goal, _LINE, step)
+        self._after[movers[beside | outside]] = _NOTHING
+        self._leg[movers[on_line & (to_foot == 0)]] = _LINE
+
+    def _allowed(self, movers: Indices, goal: Array, step: int) -> Array:
+        """The goals, each moved within 200 units to where it is allowed if it is not."""
+        goal = goal.copy()
+        wrong = np.flatnonzero(self._ground.is_closed(goal) | self._ground.is_outside(goal))
+        middle, attempt = goal[wrong], 0
+        while len(wrong):
+            shift = self._draw(movers[wrong], step, _STREAM_NEAR, attempt)
+            # Wider with every hundredth attempt: a point may lie deep in an obstacle.
+            reach = _SCATTER * (1 + attempt // 100)
+            trial = self._ground.snap(middle + reach * (2.0 * shift - 1.0))
+            right = ~(self._ground.is_closed(trial) | self._ground.is_outside(trial))
+            goal[wrong[right]] = trial[right]
+            wrong, middle, attempt = wrong[~right], middle[~right], attempt + 1
+        return goal
+
+    def _open_point(self, movers: Indices, step: int, stream: int) -> Array:
+        """A random point of the map that is allowed, a mover [n, 2]."""
+        point, wrong, attempt = np.zeros((len(movers), 2)), np.arange(len(movers)), 0
+        while len(wrong):
+            trial = self._ground.snap(self._draw(movers[wrong], step, stream, attempt) * (self._ground.size - 1.0))
+            right = ~(self._ground.is_closed(trial) | self._ground.is_outside(trial))
+            point[wrong[right]] = trial[right]
+            wrong, attempt = wrong[~right], attempt + 1
+        return point
+
+    def _draw(self, movers: Indices, step: int, stream: int, attempt: int) -> Array:
+        index = self._mover[movers] + len(self.kinds) * attempt
+        return self._draws.point(self._row[movers], stream, step, index)
