@@ -48,7 +48,7 @@ class CellGround:
         """Off the map."""
         return self.is_outside(point)
 
-    def ends_line(self, point: Array, speed: Array) -> Mask:
+    def ends_line(self, point: Array, ahead: Array, speed: Array) -> Mask:
         """Within one step of the edge."""
         ends: Mask = np.any((point <= speed[:, None]) | (point >= self.side - speed[:, None]), axis=-1)
         return ends

@@ -77,9 +77,20 @@ AIRPLANE = MoverKind("airplane", 127.0, 2.0, is_cyclic=True)
 class Ground(Protocol):
     """What a world tells its searchers; all points are [N, 2]."""
 
-    size: Array
-    detours_before_spiral: bool
-    acts_on_arrival: bool
+    @property
+    def size(self) -> Array:
+        """Width and height."""
+        ...
+
+    @property
+    def detours_before_spiral(self) -> bool:
+        """Whether a spiral is flown only after a further random point."""
+        ...
+
+    @property
+    def acts_on_arrival(self) -> bool:
+        """Whether the step that finds a leg finished already belongs to the next."""
+        ...
 
     def snap(self, point: Array) -> Array:
         """The nearest point at which something can stand (whole cells)."""
@@ -97,8 +108,8 @@ class Ground(Protocol):
         """Corners at which a spiral breaks off."""
         ...
 
-    def ends_line(self, point: Array, speed: Array) -> Mask:
-        """Where a mover on a line has come to its end."""
+    def ends_line(self, point: Array, ahead: Array, speed: Array) -> Mask:
+        """Where a mover of top `speed` [N] on a line, about to go from `point` to `ahead`, has come to its end."""
         ...
 
     def is_near_obstacle(self, point: Array) -> Mask:
@@ -216,7 +227,7 @@ class Pursuit:
         is_line = leg == _LINE
         spent = is_line.copy()
         lines = np.flatnonzero(is_line)
-        spent[lines] = self._ground.ends_line(here[lines], self._speed[movers[lines]])
+        spent[lines] = self._ends_line(movers[lines])
         after = self._after[movers]
         arrived = there & (leg == _GO)
         self._leg[movers[arrived & (after == _LINE)]] = _LINE
@@ -227,6 +238,11 @@ class Pursuit:
         self._go_corner(cornered[~is_last], step)
         self._plan_spiral(movers[arrived & (after == _NOTHING)], step)
         self._go_random(np.concatenate([cornered[is_last], movers[spent]]), step)
+
+    def _ends_line(self, movers: Indices) -> Mask:
+        here, top = self._position[movers], self._speed[movers]
+        speed = np.where(self._fast_steps[movers] > 0, top, np.minimum(self._slow_speed[movers], top))
+        return self._ground.ends_line(here, here + self._heading[movers] * speed[:, None], top)
 
     def _go(self, movers: Indices, goal: Array, after: int, step: int) -> None:
         """Plan to go to a point, or near it where it is not allowed, and then what `after` says."""
