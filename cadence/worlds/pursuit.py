@@ -326,8 +326,8 @@ class Pursuit:
         middle, attempt = goal[wrong], 0
         while len(wrong):
             shift = self._draw(movers[wrong], step, _STREAM_NEAR, attempt)
-            # Wider with every hundredth attempt: a point may lie deep in an obstacle.
-            reach = _SCATTER * (1 + attempt // 100)
+            # Wider with every eighth attempt: a point may lie deep in an obstacle.
+            reach = _SCATTER * (1 + attempt // 8)
             trial = self._ground.snap(middle + reach * (2.0 * shift - 1.0))
             right = ~(self._ground.is_closed(trial) | self._ground.is_outside(trial))
             goal[wrong[right]] = trial[right]
