@@ -1,0 +1,88 @@
+"""Best-first search over a grid of blocks, with the order of visits of the original Prison Escape planner.
+
+Where coverage is constant thousands of ways cost the same, and which of them is taken is decided by the order of the queue
+and by the last bits of the sums. So both are kept: the queue is ordered by (estimate, cost, block, block before), a block is
+closed at its first visit, and the estimate counts the price of the block itself twice, which makes the search slightly
+greedy: it avoids bright blocks beyond what the shortest way would.
+"""
+
+import math
+from heapq import heappop, heappush
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cadence.worlds.draws import Array, Indices
+
+_MOVES = [(1, 0), (0, 1), (-1, 0), (0, -1), (1, 1), (-1, 1), (-1, -1), (1, -1)]
+
+
+class BlockPlanner:
+    """Ways over a square grid of prices [n, n]; blocks with prices at or below zero are closed. Answers are kept."""
+
+    def __init__(self, price: Array, factor: float) -> None:
+        self.side = len(price)
+        self.is_open: NDArray[np.bool_] = price.ravel() > 0
+        cost = (price * factor).ravel().tolist()
+        self._neighbours = [self._around(block, cost) for block in range(self.side**2)]
+        self._distance: dict[int, list[float]] = {}
+        self._known: dict[tuple[int, int], Indices] = {}
+
+    def plan(self, start: int, goal: int) -> Indices:
+        """The way from `start` to `goal` [W, 2], both included; blocks are numbered x * n + y.
+
+        Raises `ValueError` where there is no way.
+        """
+        way = self._known.get((start, goal))
+        if way is None:
+            numbers = np.array(self._search(start, goal))
+            way = self._known[start, goal] = np.stack([numbers // self.side, numbers % self.side], axis=-1)
+        return way
+
+    def _around(self, block: int, cost: list[float]) -> list[tuple[int, float, float]]:
+        """Open neighbours: number, length of the move, price."""
+        x, y = divmod(block, self.side)
+        found = []
+        for dx, dy in _MOVES:
+            number = (x + dx) * self.side + y + dy
+            if 0 <= x + dx < self.side and 0 <= y + dy < self.side and self.is_open[number]:
+                found.append((number, 1.0 if dx == 0 or dy == 0 else math.sqrt(2.0), cost[number]))
+        return found
+
+    def _distance_to(self, goal: int) -> list[float]:
+        """Straight distance of every block to the goal."""
+        if goal not in self._distance:
+            x, y = divmod(goal, self.side)
+            along = np.arange(self.side, dtype=np.float64)
+            self._distance[goal] = np.sqrt((along[:, None] - x) ** 2 + (along - y) ** 2).ravel().tolist()
+        return self._distance[goal]
+
+    def _search(self, start: int, goal: int) -> list[int]:
+        distance, neighbours = self._distance_to(goal), self._neighbours
+        count = self.side**2
+        best, before, is_closed = [math.inf] * count, [-1] * count, bytearray(count)
+        queue = [(distance[start], 0.0, start)]
+        while queue:
+            _, cost, block = heappop(queue)
+            if is_closed[block]:
+                continue
+            is_closed[block] = 1
+            if block == goal:
+                break
+            for number, length, price in neighbours[block]:
+                if is_closed[number]:
+                    continue
+                reached = cost + length + price
+                # The first visit comes from the cheapest predecessor, of equals the one with the least number: others need
+                # not be queued.
+                if reached < best[number]:
+                    best[number], before[number] = reached, block
+                    heappush(queue, (reached + distance[number] + price, reached, number))
+                elif reached == best[number] and block < before[number]:
+                    before[number] = block
+        if not is_closed[goal]:
+            raise ValueError(f"no way from block {start} to block {goal}")
+        way = [goal]
+        while way[-1] != start:
+            way.append(before[way[-1]])
+        return way[::-1]
