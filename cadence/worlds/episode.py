@@ -30,7 +30,7 @@ class SensorReports:
 
 @dataclass(frozen=True, eq=False)
 class Episode:
-    """One mission in a world. Frame: x east, y north, metres, origin in the middle of the map.
+    """One mission in a world. Frame: x east, y north, metres; the origin is the terrain's.
 
     time_s    [T] seconds since the beginning
     truth_m   [A, T, 2] true positions of the agents

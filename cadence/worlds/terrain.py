@@ -13,9 +13,9 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Terrain:
-    """Obstacles in a square map; origin in the middle, x east, y north, metres.
+    """Obstacles in a map; x east, y north, metres; origin in the middle, in "prison" and "narco" in the south-west corner.
 
-    side_m     length of the map's side
+    side_m     length of the map's side, of the longer one if it is not square
     circles_m  [C, 3] x, y, radius
     polygons_m one array [V, 2] a polygon: vertices in order, the first not repeated
     """
