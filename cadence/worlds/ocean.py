@@ -92,8 +92,6 @@ class Ocean:
     is_land: NDArray[np.bool_]
     wave: Array
     size: Array = field(default_factory=SIZE.copy)
-    detours_before_spiral: bool = False
-    acts_on_arrival: bool = True
 
     def cell_of(self, point: Array) -> Indices:
         """Column and row of the cell that holds each point [..., 2]."""
@@ -107,10 +105,6 @@ class Ocean:
         cell = self.cell_of(point)
         height: Array = self.wave[min(step // STEPS_PER_CHART, NUM_CHARTS - 1), cell[..., 0], cell[..., 1]]
         return height / 15.0
-
-    def snap(self, point: Array) -> Array:
-        """Things stand anywhere."""
-        return point
 
     def is_outside(self, point: Array) -> Mask:
         """Off the map, or within a kilometre of its edge."""
@@ -131,10 +125,6 @@ class Ocean:
         """Within a full step of the edge, or before land."""
         edge: Mask = np.any((point <= speed[:, None]) | (point >= self.size - speed[:, None]), axis=-1)
         return np.logical_or(edge, self.is_closed(ahead))
-
-    def is_near_obstacle(self, point: Array) -> Mask:
-        """Never: nothing here depends on it."""
-        return np.zeros(len(point), dtype=bool)
 
     def settle(self, point: Array, heading: Array, otherwise: Array) -> Array:
         """A point on land moves on along its heading in steps of 10 km, 2000 km at most; failing that, `otherwise`."""

@@ -1,4 +1,4 @@
-"""How the searching side of the paper's two worlds moves: parties and helicopters on land, vessels and aeroplanes at sea.
+"""How searchers move at sea, and what kinds of searchers the paper's two worlds have.
 
 The policy is that of the authors' simulators (BlueHeuristic and MovingObject; read for facts, written anew for batches).
 Every mover holds a plan and follows it until the next detection:
@@ -10,17 +10,16 @@ Every mover holds a plan and follows it until the next detection:
   target where it gets there first, after it where the target does; a mover that is behind goes to where the target was and
   on after it; one whose foot is off the map goes to the point of the map next to it; one that could be there in a step goes;
 * along the line it is fast until the target should be near (30 units behind, 200 ahead), then slow (22 behind, 8 ahead);
-* after a point without a line it flies a square spiral, then goes to a random point, and so on.
+* after a point without a line it runs a square spiral around it, then goes to a random point, and so on.
 
-Aircraft work in cycles: 200 steps in the air, 40 on the ground, where they keep their plan, hear no command, and still
-see. As in the original, a spiral on land is flown only after a further random point, except near a mountain: the mover
-goes away, comes back, and searches then (the recorded motion of the authors' simulator shows it).
+Aircraft work in cycles: 200 steps in the air, 40 at rest, where they keep their plan, hear no command, and still see.
 
 Decided here, where the original does something that cannot be meant: the side on which a mover is, is taken from the whole
-direction and not from its x component; destinations that are not allowed are drawn anew when they are planned and not when
-they are approached; a line that runs into land ends there, as it does at the map's edge.
+direction and not from its x component, which says nothing of a target that goes north; a line that runs into land ends there,
+as it does at the map's edge, and a spiral breaks off at land; a destination that is not allowed is drawn anew around it.
+`cadence.worlds.prison_search` is the same policy on land, with its rounding to cells and its mountain.
 
-Units are the world's (cells or kilometres) and steps.
+Units are the world's and steps.
 """
 
 from collections.abc import Sequence
@@ -82,20 +81,6 @@ class Ground(Protocol):
         """Width and height."""
         ...
 
-    @property
-    def detours_before_spiral(self) -> bool:
-        """Whether a spiral is flown only after a further random point."""
-        ...
-
-    @property
-    def acts_on_arrival(self) -> bool:
-        """Whether the step that finds a leg finished already belongs to the next."""
-        ...
-
-    def snap(self, point: Array) -> Array:
-        """The nearest point at which something can stand (whole cells)."""
-        ...
-
     def is_outside(self, point: Array) -> Mask:
         """Where plans may not lead because it is off the map."""
         ...
@@ -110,10 +95,6 @@ class Ground(Protocol):
 
     def ends_line(self, point: Array, ahead: Array, speed: Array) -> Mask:
         """Where a mover of top `speed` [N] on a line, about to go from `point` to `ahead`, has come to its end."""
-        ...
-
-    def is_near_obstacle(self, point: Array) -> Mask:
-        """Where a spiral begins at once though others make a detour first."""
         ...
 
     def settle(self, point: Array, heading: Array, otherwise: Array) -> Array:
@@ -188,13 +169,10 @@ class Pursuit:
     def advance(self, step: int, is_running: Mask) -> None:
         """Move from `step` - 1 to `step` in the episodes [B] that go on."""
         movers = self._listening(is_running, step - 1)
-        if self._ground.acts_on_arrival:
-            for _ in range(3):  # the next leg may end here, too
-                self._finish_legs(movers, step)
+        for _ in range(3):  # the next leg may end here, too
+            self._finish_legs(movers, step)
         direction, speed = self._steer(movers)
         self._fast_steps[movers[self._leg[movers] == _LINE]] -= 1
-        if not self._ground.acts_on_arrival:
-            self._finish_legs(movers, step)
         moves = np.array([is_working(kind, step) for kind in self.kinds])[self._mover[movers]]
         moving = movers[moves]
         self._position[moving] = self._ground.move(self._position[moving], direction[moves], speed[moves])
@@ -231,11 +209,10 @@ class Pursuit:
         after = self._after[movers]
         arrived = there & (leg == _GO)
         self._leg[movers[arrived & (after == _LINE)]] = _LINE
-        self._go_corner(movers[arrived & (after == _SPIRAL)], step)
         cornered = movers[there & (leg == _SPIRAL)]
         self._corner[cornered] += 1
         is_last = self._corner[cornered] >= self._num_corners[cornered]
-        self._go_corner(cornered[~is_last], step)
+        self._go_corner(cornered[~is_last])
         self._plan_spiral(movers[arrived & (after == _NOTHING)], step)
         self._go_random(np.concatenate([cornered[is_last], movers[spent]]), step)
 
@@ -255,7 +232,7 @@ class Pursuit:
             self._goal[movers] = self._open_point(movers, step, _STREAM_RANDOM)
 
     def _plan_spiral(self, movers: Indices, step: int) -> None:
-        """A spiral around where the movers are, after a random point where that is the custom."""
+        """A spiral around where the movers are, as far as there is room; a random point where there is none."""
         if not len(movers):
             return
         here = self._position[movers]
@@ -263,28 +240,13 @@ class Pursuit:
         ends = self._ground.ends_spiral(corners.reshape(-1, 2)).reshape(len(movers), -1)
         count = np.where(ends.any(axis=1), ends.argmax(axis=1), len(_OFFSETS))
         self._middle[movers], self._corner[movers], self._num_corners[movers] = here, 0, count
-        away = count == 0
-        if self._ground.detours_before_spiral:
-            away |= ~self._ground.is_near_obstacle(here)
-        self._go_random(movers[away], step)
-        self._after[movers[away & (count > 0)]] = _SPIRAL
-        self._go_corner(movers[~away], step)
+        self._go_random(movers[count == 0], step)
+        self._go_corner(movers[count > 0])
 
-    def _go_corner(self, movers: Indices, step: int) -> None:
-        """Make for the next corner of the spiral, or for a point near it where it is not allowed."""
-        if not len(movers):
-            return
-        # A closed corner is replaced by a plain way-point; the spiral goes on behind it.
-        goal = self._middle[movers] + _OFFSETS[self._corner[movers]]
-        closed = self._ground.is_closed(goal)
+    def _go_corner(self, movers: Indices) -> None:
+        """Make for the next corner of the spiral."""
         self._leg[movers] = _SPIRAL
-        self._goal[movers] = goal
-        if closed.any():
-            off = movers[closed]
-            self._corner[off] += 1
-            is_last = self._corner[off] >= self._num_corners[off]
-            self._go(off[is_last], goal[closed][is_last], _NOTHING, step)
-            self._go(off[~is_last], goal[closed][~is_last], _SPIRAL, step)
+        self._goal[movers] = self._middle[movers] + _OFFSETS[self._corner[movers]]
 
     def _intercept(self, movers: Indices, step: int, target: Array, way: Array, steps: Array) -> None:
         """Plan to cut off a target [n, 2] that came `way` [n, 2] in `steps` [n]."""
@@ -293,7 +255,7 @@ class Pursuit:
         heading = np.where(length[:, None] > 0, way / np.where(length > 0, length, 1.0)[:, None], [1.0, 0.0])
         speed = length / steps
         along = ((here - target) * heading).sum(axis=-1)
-        foot = ground.snap(target + along[:, None] * heading)
+        foot = target + along[:, None] * heading
         distance = np.hypot(*(here - target).T)
         to_foot = np.hypot(*(foot - here).T)
         from_target = np.hypot(*(foot - target).T)
@@ -328,7 +290,7 @@ class Pursuit:
             shift = self._draw(movers[wrong], step, _STREAM_NEAR, attempt)
             # Wider with every eighth attempt: a point may lie deep in an obstacle.
             reach = _SCATTER * (1 + attempt // 8)
-            trial = self._ground.snap(middle + reach * (2.0 * shift - 1.0))
+            trial = middle + reach * (2.0 * shift - 1.0)
             right = ~(self._ground.is_closed(trial) | self._ground.is_outside(trial))
             goal[wrong[right]] = trial[right]
             wrong, middle, attempt = wrong[~right], middle[~right], attempt + 1
@@ -338,7 +300,7 @@ class Pursuit:
         """A random point of the map that is allowed, a mover [n, 2]."""
         point, wrong, attempt = np.zeros((len(movers), 2)), np.arange(len(movers)), 0
         while len(wrong):
-            trial = self._ground.snap(self._draw(movers[wrong], step, stream, attempt) * (self._ground.size - 1.0))
+            trial = self._draw(movers[wrong], step, stream, attempt) * (self._ground.size - 1.0)
             right = ~(self._ground.is_closed(trial) | self._ground.is_outside(trial))
             point[wrong[right]] = trial[right]
             wrong, attempt = wrong[~right], attempt + 1

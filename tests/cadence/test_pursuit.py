@@ -1,17 +1,44 @@
+from dataclasses import dataclass, field
+
 import numpy as np
 import pytest
 
-from cadence.worlds.cells import CellGround
 from cadence.worlds.draws import Draws
-from cadence.worlds.pursuit import HELICOPTER, PARTY, Pursuit, is_working
-
-MOUNTAIN = np.array([[1600.0, 1800.0]])
-NO_MOUNTAIN = np.zeros((0, 2))
-ROUNDING = 0.5 * np.sqrt(2.0) + 1e-9
+from cadence.worlds.pursuit import AIRPLANE, VESSEL, Pursuit, is_working
 
 
-def _pursuit(kinds=(PARTY,), episodes=(0,), mountains=NO_MOUNTAIN, **ground):
-    return Pursuit(CellGround(2428, mountains, **ground), kinds, Draws(7, np.array(episodes)))
+@dataclass
+class Square:
+    """A square sea with a round island that nobody enters; ways are straight."""
+
+    island: float = 0.0
+    size: np.ndarray = field(default_factory=lambda: np.array([2400.0, 2400.0]))
+
+    def is_outside(self, point):
+        return ((point < 1.0) | (point > self.size - 1.0)).any(axis=-1)
+
+    def is_closed(self, point):
+        return np.hypot(*np.moveaxis(point - 1600.0, -1, 0)) < self.island
+
+    def ends_spiral(self, point):
+        return self.is_outside(point) | self.is_closed(point)
+
+    def ends_line(self, point, ahead, speed):
+        return ((point <= speed[:, None]) | (point >= self.size - speed[:, None])).any(axis=-1) | self.is_closed(ahead)
+
+    def settle(self, point, heading, otherwise):
+        return np.where(self.is_closed(point)[:, None], otherwise, point)
+
+    def aim(self, position, goal):
+        return goal
+
+    def move(self, position, direction, speed):
+        moved = np.clip(position + direction * speed[:, None], 0.0, self.size)
+        return np.where(self.is_closed(moved)[:, None], position, moved)
+
+
+def _pursuit(kinds=(VESSEL,), episodes=(0,), island=0.0):
+    return Pursuit(Square(island), kinds, Draws(7, np.array(episodes)))
 
 
 def _run(pursuit, first, count):
@@ -25,7 +52,7 @@ def _run(pursuit, first, count):
 
 
 def _see_twice(place, target, way, steps=10):
-    """A party at `place` when the target has come `way` to `target` in `steps` since its last detection."""
+    """A vessel at `place` when the target has come `way` to `target` in `steps` since its last detection."""
     pursuit = _pursuit()
     pursuit.notice(1, np.array([True]), np.array([target]) - way)
     pursuit.position[:] = place
@@ -34,17 +61,17 @@ def _see_twice(place, target, way, steps=10):
 
 
 def test_first_detection_sends_everybody_there():
-    pursuit = _pursuit((PARTY, PARTY, HELICOPTER))
+    pursuit = _pursuit((VESSEL, VESSEL, AIRPLANE))
     target = np.array([1000.0, 900.0])
     before = np.hypot(*(pursuit.position[0] - target).T)
     pursuit.notice(0, np.array([True]), target[None])
-    after = np.hypot(*(_run(pursuit, 1, 5)[-1, 0] - target).T)
-    assert (before[:2] - after[:2] > 5 * 5.9).all()
-    assert after[2] < max(10.0, before[2] - 5 * 125.0 + 1.0)
+    distance = np.hypot(*np.moveaxis(_run(pursuit, 1, 5)[:, 0] - target, -1, 0))
+    np.testing.assert_allclose(before[:2] - distance[-1, :2], 5 * 6.5)
+    assert before[2] < 5 * 127.0 and distance[:, 2].min() <= 10.0
 
 
 def test_mover_ahead_goes_to_the_foot_of_the_perpendicular_and_meets_the_target():
-    # The target comes along y = 500 in the direction of +x; the party is 130 above the line, 900 ahead.
+    # The target comes along y = 500 in the direction of +x; the vessel is 130 above the line, 900 ahead.
     pursuit, step = _see_twice([1900.0, 630.0], [1000.0, 500.0], [75.0, 0.0])
     track = _run(pursuit, step, 60)[:, 0, 0]
     assert np.hypot(*(track - [1900.0, 500.0]).T).min() <= 10.0
@@ -81,7 +108,7 @@ def test_foot_off_the_map_is_replaced_by_the_nearest_point_of_it():
 
 
 def test_spiral_visits_the_corners_of_growing_squares():
-    pursuit = _pursuit(detours_before_spiral=False)
+    pursuit = _pursuit()
     pursuit.position[:] = [1200.0, 1200.0]
     pursuit.notice(0, np.array([True]), np.array([[1200.0, 1200.0]]))
     track = _run(pursuit, 1, 90)[:, 0, 0]
@@ -89,42 +116,49 @@ def test_spiral_visits_the_corners_of_growing_squares():
         assert np.hypot(*(track - corner).T).min() <= 10.0
 
 
-def test_after_arrival_on_land_the_mover_goes_away_and_comes_back_for_the_spiral():
-    pursuit = _pursuit((HELICOPTER,))
-    pursuit.position[:] = [1200.0, 1200.0]
-    pursuit.notice(0, np.array([True]), np.array([[1200.0, 1200.0]]))
-    track = _run(pursuit, 1, 199)[:, 0, 0]
-    distance, moved = np.hypot(*(track[1:] - 1200.0).T), np.hypot(*np.diff(track, axis=0).T)
-    away = int(np.argmax((moved <= 30.0 + ROUNDING) & (distance > 200.0)))
-    assert moved[:away].max() > 126.0 and distance[away] > 200.0
-    back = away + int(np.argmax(distance[away:] < 80.0))
-    assert distance[back] < 80.0
-    assert moved[away + 1 : back].max() <= 30.0 + ROUNDING  # the way back belongs to the spiral
+def test_spiral_that_has_no_room_becomes_a_random_point():
+    pursuit = _pursuit()
+    pursuit.position[:] = [2380.0, 1200.0]  # the first corner would lie off the map
+    pursuit.notice(0, np.array([True]), np.array([[2380.0, 1200.0]]))
+    track = _run(pursuit, 1, 60)[:, 0, 0]
+    assert np.hypot(*(track[-1] - [2380.0, 1200.0])) > 300.0
+
+
+def test_line_ends_at_land():
+    # The vessel is behind the target and follows it into the island, where it gives up.
+    target, way = np.array([1300.0, 1600.0]), np.array([75.0, 0.0])
+    pursuit = _pursuit(island=150.0)
+    pursuit.notice(1, np.array([True]), (target - way)[None])
+    pursuit.position[:] = target - 2 * way
+    pursuit.notice(11, np.array([True]), target[None])
+    track = _run(pursuit, 12, 150)[:, 0, 0]
+    moved = np.hypot(*np.diff(track, axis=0).T)
+    assert np.hypot(*(track - 1600.0).T).min() < 160.0
+    assert (moved == 0).sum() < 20
 
 
 def test_nobody_is_faster_than_his_kind_or_leaves_the_map():
-    pursuit = _pursuit((HELICOPTER, PARTY, PARTY), range(20), MOUNTAIN)
+    pursuit = _pursuit((AIRPLANE, VESSEL, VESSEL), range(20), 150.0)
     rng = np.random.default_rng(1)
     target, running = rng.uniform(300, 2100, (20, 2)), np.ones(20, dtype=bool)
     before = pursuit.position.copy()
     for step in range(1, 400):
-        target = np.clip(target + rng.normal(0.0, 5.0, (20, 2)), 0, 2427)
-        pursuit.notice(step - 1, rng.random(20) < 0.1, np.rint(target))
+        target = np.clip(target + rng.normal(0.0, 5.0, (20, 2)), 0, 2400)
+        pursuit.notice(step - 1, rng.random(20) < 0.1, target)
         pursuit.advance(step, running)
         moved = np.hypot(*np.moveaxis(pursuit.position - before, -1, 0))
-        assert (moved <= np.array([127.0, 6.5, 6.5]) + ROUNDING).all()
-        assert (pursuit.position >= 0).all() and (pursuit.position <= 2427).all()
-        assert (pursuit.position == np.rint(pursuit.position)).all()
-        assert np.hypot(*np.moveaxis(pursuit.position[:, 1:] - MOUNTAIN[0], -1, 0)).min() > 140.0 - 8.0
-        if not is_working(HELICOPTER, step):
+        assert (moved <= np.array([127.0, 6.5, 6.5]) + 1e-9).all()
+        assert (pursuit.position >= 0).all() and (pursuit.position <= 2400).all()
+        assert np.hypot(*np.moveaxis(pursuit.position - 1600.0, -1, 0)).min() >= 150.0
+        if not is_working(AIRPLANE, step):
             assert (moved[:, 0] == 0).all()
         before = pursuit.position.copy()
-    assert not is_working(HELICOPTER, 200) and is_working(HELICOPTER, 240) and is_working(PARTY, 200)
+    assert not is_working(AIRPLANE, 200) and is_working(AIRPLANE, 240) and is_working(VESSEL, 200)
 
 
 def test_batch_neighbours_and_repetition_change_nothing():
     def tracks(episodes):
-        pursuit = _pursuit((HELICOPTER, PARTY), episodes, MOUNTAIN)
+        pursuit = _pursuit((AIRPLANE, VESSEL), episodes, 150.0)
         way = []
         for step in range(1, 260):
             seen = np.array([(step + episode) % 37 < 2 for episode in episodes])
@@ -141,13 +175,8 @@ def test_batch_neighbours_and_repetition_change_nothing():
 
 
 def test_finished_episodes_stand_still():
-    pursuit = _pursuit((PARTY,), (0, 1))
+    pursuit = _pursuit((VESSEL,), (0, 1))
     before = pursuit.position.copy()
     pursuit.advance(1, np.array([True, False]))
     moved = (pursuit.position != before).any(axis=(1, 2))
     assert moved.tolist() == [True, False]
-
-
-def test_mountains_of_a_wrong_shape_are_refused():
-    with pytest.raises(ValueError, match="expected \\[K, 2\\]"):
-        CellGround(2428, np.zeros(2))
