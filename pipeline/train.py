@@ -13,13 +13,17 @@ from pipeline.manifest import StageResult
 from pipeline.progress import Progress
 from pipeline.train_absolute import AbsoluteTraining, train_absolute
 from pipeline.train_general import train_general
+from pipeline.train_rivals import RIVALS, RivalTraining, train_rivals
+from pipeline.train_scene import SceneTraining, train_scene
 
 
 @dataclass(frozen=True)
 class TrainConfig:
     """What to train, on what, for how long.
 
-    preset            "general" (residual of the bank) or "paper" (absolute coordinates, the published architecture)
+    preset            "general" (residual of the bank), "paper" (absolute coordinates, the published architecture), "scene" (one
+                      place learned by heart), or one of the paper's rivals: "vrnn", "grammi_without_mi", "grammi" (which
+                      trains the one without first)
     data              folder of MCAP logs with truth; None = synthetic kinematics (general) or the simulator (paper)
     seed              of weights, data and noise
     batch_size        windows a step
@@ -29,9 +33,11 @@ class TrainConfig:
     threads           of torch; None = as many as there are cores
     network, windows  of the general preset
     paper             of the paper preset
+    scene             of the scene preset
+    rival             of the rivals
     """
 
-    preset: Literal["general", "paper"] = "general"
+    preset: Literal["general", "paper", "scene", "vrnn", "grammi_without_mi", "grammi"] = "general"
     data: Path | None = None
     seed: int = 0
     batch_size: int = 128
@@ -44,6 +50,8 @@ class TrainConfig:
     windows: SyntheticConfig = field(default_factory=SyntheticConfig)
     optimiser: OptimiserConfig = field(default_factory=OptimiserConfig)
     paper: AbsoluteTraining = field(default_factory=AbsoluteTraining)
+    scene: SceneTraining = field(default_factory=SceneTraining)
+    rival: RivalTraining = field(default_factory=RivalTraining)
 
     def __post_init__(self) -> None:
         if self.batch_size < 2:
@@ -67,5 +75,7 @@ def train(out: Path, config: TrainConfig, progress: Progress, force: bool = Fals
     """
     if config.threads is not None:
         torch.set_num_threads(config.threads)
-    preset = train_absolute if config.preset == "paper" else train_general
-    return preset(out, config, progress, force)
+    if config.preset in RIVALS:
+        return train_rivals(out, config, progress, force)
+    presets = {"general": train_general, "paper": train_absolute, "scene": train_scene}
+    return presets[config.preset](out, config, progress, force)
