@@ -28,6 +28,7 @@ from cadence.diffusion.inpainting import (
     overwritten_at_level,
     smoother_correction,
 )
+from cadence.diffusion.noise import RowNoise
 from cadence.diffusion.sampler import Hook, sample_ddim, sample_ddpm, sample_dpmpp_2m
 from cadence.errors import ConfigError
 from cadence.network.trajectory import TrajectoryNetwork, TrajectoryNetworkConfig
@@ -144,7 +145,7 @@ class AbsoluteModel:
         for begin in range(0, len(seeds), per_chunk):
             pick = slice(begin, begin + per_chunk)
             frame = self._frame(nodes[torch.arange(len(seeds))[pick]], window[pick], agent[pick])
-            parts.append(self._sample_rows(frame, _RowNoise(seeds[pick]), num_hypotheses))
+            parts.append(self._sample_rows(frame, RowNoise(seeds[pick]), num_hypotheses))
         return scatter_hypotheses(torch.cat(parts), windows)
 
     def _check(self, windows: WindowBatch) -> None:
@@ -187,7 +188,7 @@ class AbsoluteModel:
             columns.append(context.elapsed_s.double()[window, None] / (self.config.step_s * self.config.age_scale_steps))
         return torch.cat(columns, dim=-1)[:, None].float() if columns else None
 
-    def _sample_rows(self, frame: "_Frame", stream: "_RowNoise", num_hypotheses: int) -> Tensor:
+    def _sample_rows(self, frame: "_Frame", stream: "RowNoise", num_hypotheses: int) -> Tensor:
         """Hypotheses [R, K, T, 2] in metres relative to the datum."""
         detections = self._detections(frame)
         start = stream.draw((num_hypotheses, self.config.network.num_steps, 2))
@@ -292,24 +293,6 @@ class _Denoiser:
             rows, observed = rows.repeat_interleave(times, dim=0), observed.repeat_interleave(times, dim=0)
             extra = None if extra is None else extra.repeat_interleave(times, dim=0)
         return self.model.network.encode(rows, observed, extra)
-
-
-class _RowNoise:
-    """A random stream a row, so that a row's numbers do not depend on which others are computed with it."""
-
-    def __init__(self, seeds: Tensor) -> None:
-        self.generators = [torch.Generator().manual_seed(seed) for seed in seeds.tolist()]
-
-    def draw(self, shape: Sequence[int]) -> Tensor:
-        """Standard normal [R, *shape]."""
-        return torch.stack([torch.randn(tuple(shape), generator=generator) for generator in self.generators])
-
-    def draw_each(self, num_hypotheses: int, is_used: Tensor) -> Tensor:
-        """Standard normal [R, K, N, 2], zero for detections that are not used; left-packed, whatever the padding."""
-        noise = torch.zeros(len(is_used), num_hypotheses, is_used.shape[1], 2)
-        for row, (generator, count) in enumerate(zip(self.generators, is_used.sum(dim=1).tolist(), strict=True)):
-            noise[row, :, :count] = torch.randn(num_hypotheses, count, 2, generator=generator)
-        return noise
 
 
 def detection_rows(age: Tensor, position: Tensor, is_observed: Tensor, keep: int) -> tuple[Tensor, Tensor]:

@@ -1,0 +1,24 @@
+"""Random numbers that belong to a row of a batch, whoever its neighbours are."""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+
+class RowNoise:
+    """A random stream a row, so that a row's numbers do not depend on which others are computed with it."""
+
+    def __init__(self, seeds: Tensor) -> None:
+        self.generators = [torch.Generator().manual_seed(seed) for seed in seeds.tolist()]
+
+    def draw(self, shape: Sequence[int]) -> Tensor:
+        """Standard normal [R, *shape]."""
+        return torch.stack([torch.randn(tuple(shape), generator=generator) for generator in self.generators])
+
+    def draw_each(self, num_hypotheses: int, is_used: Tensor) -> Tensor:
+        """Standard normal [R, K, N, 2], zero for detections that are not used; left-packed, whatever the padding."""
+        noise = torch.zeros(len(is_used), num_hypotheses, is_used.shape[1], 2)
+        for row, (generator, count) in enumerate(zip(self.generators, is_used.sum(dim=1).tolist(), strict=True)):
+            noise[row, :, :count] = torch.randn(num_hypotheses, count, 2, generator=generator)
+        return noise

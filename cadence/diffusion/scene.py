@@ -1,0 +1,200 @@
+"""The scene model as an estimator: where a target goes in a place whose ways the network has learned.
+
+Like the paper's model (Ye et al., CADENCE, MRS 2023) it predicts from now on; unlike it, tracks are displacements that begin at
+the last detection, so that detections need no inpainting, and the stretch since then is part of every hypothesis.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Literal, Self
+
+import torch
+from torch import Tensor
+
+from cadence.bank.rows import scatter_hypotheses
+from cadence.constraints.obstacles import ObstacleConstraint, Obstacles
+from cadence.constraints.repair import repair
+from cadence.diffusion.guidance import PaperCost, adam_guidance, clean_estimate_guidance
+from cadence.diffusion.noise import RowNoise
+from cadence.diffusion.sampler import even_angles, sample_ddim, sample_ddpm, sample_dpmpp_2m
+from cadence.diffusion.scene_frame import SceneConfig, future_of, scene_inputs, to_pieces, to_track
+from cadence.diffusion.schedule import MAX_ANGLE, clean_from, cosine_schedule
+from cadence.errors import ConfigError
+from cadence.network.scene import Pieces, SceneNetwork
+from cadence.types import Context, Detections, HypothesisSet, WindowBatch
+from cadence.worlds.recordings import NUM_STEPS
+
+_START = MAX_ANGLE - 0.02
+"""Noise level that DPM-Solver++ starts from."""
+
+_CHORD = 0.25
+"""What guidance keeps from obstacles beside the margin, in pieces of the future."""
+
+
+@dataclass(frozen=True)
+class SceneSampling:
+    """How a scene model is sampled.
+
+    sampler     "few": the few steps that the weights were tuned for; "ddpm", "ddim", "dpmpp": any number for weights that
+                were trained by diffusion alone; "auto": few where the weights are tuned, else dpmpp
+    num_steps   of ddpm, ddim and dpmpp
+    guidance    away from obstacles while sampling: "clean" on the clean estimate, "paper" (algorithm 1; with ddpm), "none"
+    is_repaired lead what still crosses an obstacle around it at the end
+    margin_m    distance that is kept from obstacles
+    learning_rate, iterations  of the paper's guidance
+    chunk       tracks computed at once
+    """
+
+    sampler: Literal["auto", "few", "ddpm", "ddim", "dpmpp"] = "auto"
+    num_steps: int = 8
+    guidance: Literal["none", "clean", "paper"] = "clean"
+    is_repaired: bool = True
+    margin_m: float = 0.0
+    learning_rate: float = 1e-2
+    iterations: int = 8
+    chunk: int = 1024
+
+    def __post_init__(self) -> None:
+        if self.guidance == "paper" and self.sampler != "ddpm":
+            raise ValueError(f"guidance 'paper' moves the mean of a ddpm step; sampler is {self.sampler!r}")
+        if min(self.num_steps, self.chunk, self.iterations) < 1 or self.margin_m < 0:
+            raise ValueError("num_steps, chunk and iterations must be at least 1, margin_m not negative")
+
+
+@dataclass(frozen=True, eq=False)
+class SceneModel:
+    """A trained network as an `Estimator` for windows of one agent that begin now; `placed` binds their context.
+
+    Windows without detections are NaN. `obstacles` lie in the mission frame.
+    """
+
+    network: SceneNetwork
+    config: SceneConfig
+    sampling: SceneSampling = field(default_factory=SceneSampling)
+    context: Context | None = None
+    obstacles: Obstacles = field(default_factory=Obstacles.none)
+    name: str = "cadence"
+
+    def fit(self, tracks: Detections) -> Self:
+        """The model itself: it adapts to nothing."""
+        return self
+
+    def placed(self, context: Context, obstacles: Obstacles | None = None) -> "SceneModel":
+        """The model for windows with this context."""
+        return dataclasses.replace(self, context=context, obstacles=obstacles or self.obstacles)
+
+    @torch.no_grad()
+    def sample(self, windows: WindowBatch, num_hypotheses: int) -> HypothesisSet:
+        """Hypotheses [B, K, 1, T, 2]; a window's depend on its seed, not on its neighbours. `ConfigError` for other grids."""
+        self._check(windows)
+        assert self.context is not None
+        active = windows.is_active[:, 0]
+        known, context = windows[active], self.context[active]
+        per_chunk = max(1, self.sampling.chunk // num_hypotheses)
+        parts = [torch.zeros(0, num_hypotheses, NUM_STEPS, 2, dtype=torch.float64)]
+        for begin in range(0, known.num_windows, per_chunk):
+            rows = slice(begin, begin + per_chunk)
+            parts.append(self._sample_rows(known[rows], context[rows], num_hypotheses))
+        return scatter_hypotheses(torch.cat(parts), windows)
+
+    def _check(self, windows: WindowBatch) -> None:
+        step_s = self.config.step_s
+        if windows.origin_index or windows.num_steps != NUM_STEPS or abs(windows.step_s / step_s - 1.0) > 1e-6:
+            raise ConfigError(
+                f"infer.grid: this checkpoint predicts {NUM_STEPS} steps of {step_s:g} s from now on; set step_s = {step_s:g}, "
+                f"history_steps = 1, horizon_steps = {NUM_STEPS - 1}"
+            )
+        if windows.num_agents != 1:
+            raise ConfigError(
+                f"infer: this checkpoint knows one target, the log has {windows.num_agents}; use another checkpoint"
+            )
+        if self.context is None or len(self.context.datum_m) != windows.num_windows:
+            raise ValueError("SceneModel: the windows need a context of their own; use placed()")
+
+    def _sample_rows(self, windows: WindowBatch, context: Context, num_hypotheses: int) -> Tensor:
+        """Hypotheses [R, K, T, 2] in metres relative to the datum."""
+        inputs = scene_inputs(windows, context, self.config)
+        stream = RowNoise(windows.seeds)
+        code = self.network.encode(inputs).repeat_interleave(num_hypotheses, dim=0)
+        last_m = _last_detection(windows.detections)
+        tracks = _Tracks(self, inputs.pieces, last_m, context.datum_m, num_hypotheses)
+        pieces = inputs.pieces.repeated(num_hypotheses)
+
+        def denoise(noisy: Tensor, angle: float) -> Tensor:
+            flat = noisy.flatten(0, 1)
+            answer = self.network(flat, torch.full((len(flat),), angle), pieces, code)
+            clean = clean_from("v", answer.float(), flat, torch.tensor(angle)).reshape(noisy.shape)
+            return tracks.guided(tracks.limited(clean))
+
+        start = stream.draw((num_hypotheses, self.config.num_pieces, 2))
+        sampled = self._solved(denoise, start, stream, tracks)
+        positions = future_of(to_track(tracks.limited(sampled).double(), inputs.pieces, self.config), self.config)
+        positions = positions + last_m[:, None, None]
+        if self.obstacles.count and self.sampling.is_repaired:
+            is_pinned = torch.zeros(positions.shape[:-1], dtype=torch.bool)
+            is_pinned[..., 0] = (inputs.pieces.start[:, :1] >= 0).expand(-1, num_hypotheses)
+            offset = context.datum_m[:, None, None]
+            positions, _ = repair(positions, self.obstacles, is_pinned, self.sampling.margin_m, offset_m=offset)
+        return positions
+
+    def _solved(self, denoise: Callable[[Tensor, float], Tensor], start: Tensor, stream: RowNoise, tracks: "_Tracks") -> Tensor:
+        sampler, steps = self.sampling.sampler, self.sampling.num_steps
+        if sampler in ("auto", "few") and self.config.few_steps:
+            return sample_ddim(denoise, start, even_angles(self.config.few_steps))
+        if sampler == "few":
+            raise ConfigError("sampler 'few': these weights were not tuned for few steps; use dpmpp, ddim or ddpm")
+        if sampler == "ddpm":
+            on_mean = tracks.paper_guided if self.sampling.guidance == "paper" else _keep
+            return sample_ddpm(denoise, start, cosine_schedule(steps), lambda like: stream.draw(like.shape[1:]), on_mean)
+        if sampler == "ddim":
+            return sample_ddim(denoise, start, even_angles(steps))
+        return sample_dpmpp_2m(denoise, start, even_angles(steps, _START))
+
+
+class _Tracks:
+    """What moves the pieces [R, K, P, 2] of one chunk of windows: the speed limit, and obstacles."""
+
+    def __init__(self, model: SceneModel, pieces: Pieces, last_m: Tensor, datum_m: Tensor, num_hypotheses: int) -> None:
+        self.config, self.sampling, self.obstacles = model.config, model.sampling, model.obstacles
+        self.pieces, self.last_m = pieces, last_m[:, None, None].float()
+        self.offset_m = datum_m[:, None, None].float()
+        # how far a target may have come since the detection: what guidance may move a track by
+        self.reach_m = torch.nn.functional.pad((pieces.span * self.config.scale_m).cumsum(dim=1), (1, 0))[:, None, :, None]
+
+    def limited(self, displacement: Tensor) -> Tensor:
+        """No piece is faster than the target can be."""
+        longest = self.config.max_step_m / self.config.unit_step_m
+        length = displacement.norm(dim=-1, keepdim=True)
+        limited: Tensor = displacement * (longest / length.clamp_min(1e-6)).clamp(max=1.0)
+        return limited
+
+    def guided(self, displacement: Tensor) -> Tensor:
+        """Clean estimates moved out of obstacles."""
+        if self.sampling.guidance != "clean" or not self.obstacles.count:
+            return displacement
+        # between two knots on the edge of an obstacle a straight line cuts through it
+        slack_m = _CHORD * self.config.stride * self.config.unit_step_m
+        constraint = ObstacleConstraint(self.obstacles, self.sampling.margin_m + slack_m, self.offset_m)
+        track = to_track(displacement, self.pieces, self.config) + self.last_m
+        moved = clean_estimate_guidance(track, [constraint], self.reach_m)
+        return to_pieces(moved, self.pieces, self.config)
+
+    def paper_guided(self, mean: Tensor, angle: float) -> Tensor:
+        """Algorithm 1 on the mean of a DDPM step."""
+        cost = PaperCost(self.obstacles, unit_m=self.config.scale_m, offset_m=self.offset_m)
+
+        def cost_of(displacement: Tensor) -> Tensor:
+            return cost.cost(to_track(displacement, self.pieces, self.config) + self.last_m)
+
+        return adam_guidance(mean, cost_of, self.sampling.learning_rate, self.sampling.iterations)
+
+
+def _last_detection(detections: Detections) -> Tensor:
+    """Position [R, 2] of the last detection relative to the datum."""
+    index = (detections.count[:, 0] - 1)[:, None, None].expand(-1, 1, 2)
+    return detections.position_m[:, 0].gather(1, index)[:, 0].double()
+
+
+def _keep(state: Tensor, angle: float) -> Tensor:
+    return state

@@ -1,0 +1,158 @@
+"""Training of the scene preset: one place learned by heart, from the episodes of a world or of a folder of logs."""
+
+import dataclasses
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+import torch
+from torch import nn
+
+from cadence.diffusion.scene_frame import SceneConfig
+from cadence.errors import ConfigError
+from cadence.network.scene import Pieces, SceneInputs, SceneNetwork
+from cadence.training.loop import Loss, Trainer
+from cadence.training.scene import Dropout, SceneWindows, diffusion_loss, energy_loss, scene_windows
+from cadence.worlds.recordings import Recordings
+from pipeline.checkpoints import find_checkpoint, load_weights
+from pipeline.manifest import StageResult
+from pipeline.progress import Progress
+from pipeline.recordings import RecordingsConfig, load_recordings
+from pipeline.training_run import TrainingRun, run_training
+
+if TYPE_CHECKING:
+    from pipeline.train import TrainConfig
+
+_VALIDATION_BATCH = 250
+
+
+@dataclass(frozen=True)
+class SceneSource:
+    """Episodes to learn from.
+
+    share     of the windows of a batch, relative to the other sources
+    episodes  where they come from
+    """
+
+    share: float = 1.0
+    episodes: RecordingsConfig = field(default_factory=RecordingsConfig)
+
+
+def _worlds() -> tuple[SceneSource, ...]:
+    return tuple(SceneSource(1.0, RecordingsConfig(set=name, num_episodes=4000)) for name in ("low", "med", "high"))
+
+
+def _validation() -> tuple[SceneSource, ...]:
+    return tuple(SceneSource(1.0, RecordingsConfig(set=name, num_episodes=50, seed=1)) for name in ("low", "med", "high"))
+
+
+@dataclass(frozen=True)
+class SceneTraining:
+    """What the scene preset is trained on, and for what.
+
+    model           sizes, inputs and units; few_steps is set by the objective "energy"
+    objective       "diffusion" (noise levels at random), or "energy": a few-step sampler tuned by the energy score
+    start           checkpoint that the training starts from; "energy" needs one
+    sources         episodes to train on
+    validation      episodes to validate on
+    num_validation_windows  of each source
+    told            which windows are told of the start, the goal and the trackers
+    path_weight     of the positions' error beside that of the pieces, for "diffusion"
+    few_steps       evaluations of the sampler, for "energy"
+    num_samples     tracks a window, for "energy"
+    score_weights   of the whole track and of single pieces beside the positions, for "energy"
+    """
+
+    model: SceneConfig = field(default_factory=SceneConfig)
+    objective: Literal["diffusion", "energy"] = "diffusion"
+    start: str | None = None
+    sources: tuple[SceneSource, ...] = field(default_factory=_worlds)
+    validation: tuple[SceneSource, ...] = field(default_factory=_validation)
+    num_validation_windows: int = 1000
+    told: Dropout = field(default_factory=Dropout)
+    path_weight: float = 1.0
+    few_steps: int = 2
+    num_samples: int = 4
+    score_weights: tuple[float, float] = (0.3, 0.3)
+
+    def __post_init__(self) -> None:
+        if not self.sources or not self.validation or any(source.share <= 0 for source in self.sources + self.validation):
+            raise ValueError("sources and validation must name episodes, with positive shares")
+        if self.few_steps < 1 or self.num_samples < 2 or self.num_validation_windows < 1:
+            raise ValueError("few_steps and num_validation_windows must be at least 1, num_samples at least 2")
+        if self.objective == "energy" and self.start is None:
+            raise ValueError("the objective 'energy' tunes a trained network: name its checkpoint in start")
+
+
+def train_scene(out: Path, config: "TrainConfig", progress: Progress, force: bool = False) -> StageResult:
+    """Train the scene preset into `out`; see `pipeline.train.train`."""
+    scene = config.scene
+    parts = [load_recordings(source.episodes, out / "episodes", progress).recordings for source in scene.sources]
+    held_out = [load_recordings(source.episodes, out / "episodes", progress).recordings for source in scene.validation]
+    model = _model_config(scene)
+    if any(part.step_s != model.step_s for part in [*parts, *held_out]):
+        raise ConfigError(f"train.scene.model.step_s is {model.step_s:g} s; the episodes have another step")
+    with torch.random.fork_rng(devices=[]):  # layers take their first weights from the global stream, which is left as it was
+        torch.random.manual_seed(config.seed)
+        network = model.build()
+    if scene.start is not None:
+        load_weights(find_checkpoint(scene.start), network)
+    trainer = Trainer(network, config.optimiser)
+    shares = np.array([source.share for source in scene.sources])
+
+    def loss_at(step: int) -> Loss:
+        rng = np.random.default_rng([config.seed, step])
+        counts = rng.multinomial(config.batch_size, shares / shares.sum())
+        windows = _joined([_draw(part, int(num), scene, model, rng) for part, num in zip(parts, counts, strict=True) if num])
+        generator = torch.Generator().manual_seed(config.seed * 7_919 + step)
+        return lambda network: _loss(network, windows, scene, model, generator)
+
+    rng = np.random.default_rng([config.seed, 1, 2])
+    validation = _joined([_draw(part, scene.num_validation_windows, scene, model, rng) for part in held_out])
+
+    @torch.no_grad()
+    def validate(network: nn.Module) -> float:
+        generator = torch.Generator().manual_seed(1)
+        parts = [validation[begin : begin + _VALIDATION_BATCH] for begin in range(0, len(validation), _VALIDATION_BATCH)]
+        total = sum(float(_loss(network, part, scene, model, generator)) * len(part) for part in parts)
+        return total / len(validation)
+
+    steps = config.optimiser.num_steps
+    run = TrainingRun(out, "scene", config, model, steps, config.validate_every, config.save_every)
+    return run_training(run, trainer, loss_at, validate, progress, force)
+
+
+def _model_config(scene: SceneTraining) -> SceneConfig:
+    return dataclasses.replace(scene.model, few_steps=scene.few_steps if scene.objective == "energy" else 0)
+
+
+def _loss(
+    network: nn.Module, windows: SceneWindows, scene: SceneTraining, model: SceneConfig, generator: torch.Generator
+) -> torch.Tensor:
+    assert isinstance(network, SceneNetwork)
+    if scene.objective == "diffusion":
+        return diffusion_loss(network, windows, model, scene.path_weight, generator)
+    return energy_loss(network, windows, model, scene.num_samples, scene.score_weights, generator)
+
+
+def _draw(part: Recordings, num: int, scene: SceneTraining, model: SceneConfig, rng: np.random.Generator) -> SceneWindows:
+    """Windows at random steps, all equally likely."""
+    rows = rng.integers(0, len(part.position_m), num)
+    return scene_windows(part, rows, model, scene.told, rng)
+
+
+def _joined(parts: list[SceneWindows]) -> SceneWindows:
+    """One set of several; trackers that only some have are absent in the others."""
+    num_trackers = max(part.inputs.trackers.shape[1] for part in parts)
+    columns: dict[str, list[torch.Tensor]] = {}
+    for part in parts:
+        pad = num_trackers - part.inputs.trackers.shape[1]
+        values = {name: value for name, value in vars(part.inputs).items() if name != "pieces"} | vars(part.inputs.pieces)
+        values["trackers"] = nn.functional.pad(values["trackers"], (0, 0, 0, pad))
+        values["is_tracker"] = nn.functional.pad(values["is_tracker"], (0, pad))
+        for name, value in values.items():
+            columns.setdefault(name, []).append(value)
+    joined = {name: torch.cat(values) for name, values in columns.items()}
+    pieces = Pieces(*(joined.pop(name) for name in ("last", "start", "duration", "span")))
+    return SceneWindows(SceneInputs(**joined, pieces=pieces), torch.cat([part.clean for part in parts]))

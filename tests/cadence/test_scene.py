@@ -1,0 +1,234 @@
+"""The scene model: how tracks are stated, what the network is told, sampling, and its two losses."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from cadence import metrics
+from cadence.constraints.checker import segments_in_collision, states_in_collision
+from cadence.constraints.obstacles import Obstacles
+from cadence.diffusion.scene import SceneModel, SceneSampling
+from cadence.diffusion.scene_frame import SceneConfig, future_of, recorded_track, scene_inputs, to_pieces, to_track
+from cadence.errors import ConfigError
+from cadence.network.scene import SceneNetworkConfig
+from cadence.training import scene as training
+from cadence.training.scene import Dropout, SceneWindows, diffusion_loss, energy_loss, few_step_sample, scene_windows
+from cadence.types import Context
+from cadence.worlds.recordings import ForecastWindows, Recordings, cut_windows
+
+SMALL = SceneNetworkConfig(
+    width=16, multipliers=(1, 2), encoder_size=8, code_size=16, level_size=8, max_detections=12, map_cells=8, map_channels=2
+)
+CONFIG = SceneConfig(SMALL, centre_m=(5000.0, 5000.0), scale_m=5000.0, unit_step_m=60.0, max_step_m=100.0, stride=4)
+
+
+def recordings(num: int = 6, seed: int = 0) -> Recordings:
+    """Straight walks of 80 m a step in all directions from the middle, and three trackers somewhere."""
+    rng = np.random.default_rng(seed)
+    length = rng.integers(30, 200, num)
+    tracks = []
+    for steps in length:
+        heading = rng.uniform(0, 2 * np.pi)
+        tracks.append(5000.0 + 20.0 * np.arange(steps)[:, None] * np.array([np.cos(heading), np.sin(heading)]))
+    total = int(length.sum())
+    return Recordings(
+        60.0,
+        np.concatenate([[0], np.cumsum(length)]),
+        np.concatenate(tracks).astype(np.float32),
+        rng.random(total) < 0.2,
+        rng.uniform(0, 1e4, (total, 3, 2)).astype(np.float32),
+        rng.uniform(0, 1e4, (num, 2)).astype(np.float32),
+    )
+
+
+def windows(num: int = 8) -> ForecastWindows:
+    rec, rng = recordings(), np.random.default_rng(1)
+    episode = rng.integers(0, len(rec), num)
+    return cut_windows(rec, episode, (rng.random(num) * rec.length[episode]).astype(np.int64))
+
+
+def model(sampling: SceneSampling | None = None, config: SceneConfig = CONFIG, std: float = 0.3) -> SceneModel:
+    torch.manual_seed(0)
+    network = config.build()
+    torch.nn.init.normal_(network.unet.head.weight, std=std)
+    return SceneModel(network.eval(), config, sampling or SceneSampling(num_steps=3))
+
+
+def test_a_track_is_the_sum_of_its_pieces() -> None:
+    cut, rec = windows(), recordings()
+    inputs = scene_inputs(cut.windows, cut.context, CONFIG)
+    rows = rec.offset[cut.episode.numpy()] + cut.step.numpy()
+    track = recorded_track(rec, rows, cut.episode.numpy(), inputs.pieces)
+    pieces = to_pieces(track, inputs.pieces, CONFIG)
+    again = to_track(pieces[:, None].double(), inputs.pieces, CONFIG)[:, 0]
+    assert torch.allclose(again, track - track[:, :1], atol=0.01)
+    # the walks are straight, so that pieces lose nothing but the moment of stopping
+    error = (future_of(again, CONFIG) - cut.truth_m[:, 0]).norm(dim=-1)
+    assert float(error.max()) <= 0.5 * CONFIG.stride * 20.0 and float(error.median()) < 0.05
+
+
+def test_inputs_do_not_depend_on_padding_or_neighbours() -> None:
+    cut = windows()
+    together = scene_inputs(cut.windows, cut.context, CONFIG)
+    for row in range(len(cut)):
+        one = cut[row : row + 1]
+        alone = scene_inputs(one.windows, one.context, CONFIG)
+        assert torch.equal(alone.summary, together.summary[row : row + 1])
+        count = int(alone.is_observed.sum())
+        assert torch.equal(alone.rows[0, :count], together.rows[row, :count])
+        assert int(together.is_observed[row].sum()) == count
+
+
+def test_all_detections_are_read_where_they_fit_and_otherwise_the_last_ones_and_the_first() -> None:
+    rec = recordings()
+    rec.is_detected[:] = True
+    cut = cut_windows(rec, np.array([2, 2]), np.array([6, 25]))
+    inputs = scene_inputs(cut.windows, cut.context, CONFIG)
+    ages = (inputs.rows[..., 1] * 200.0).round()
+    assert ages[0, :7].tolist() == list(range(6, -1, -1)) and int(inputs.is_observed[0].sum()) == 7
+    assert ages[1, 0] == 25 and ages[1, -8:].tolist() == list(range(7, -1, -1)) and bool(inputs.is_observed[1].all())
+    assert bool((ages[1].diff() < 0).all())
+
+
+def test_trackers_are_a_set_and_a_goal_that_is_not_told_is_none() -> None:
+    cut, network = windows(), model().network
+    context = cut.context
+    assert context.tracker_m is not None and context.known_goal_m is not None
+
+    def code(**changes: object) -> torch.Tensor:
+        return network.encode(scene_inputs(cut.windows, dataclasses.replace(context, **changes), CONFIG)).detach()
+
+    assert torch.allclose(code(), code(tracker_m=context.tracker_m[:, :, [2, 0, 1]]), atol=1e-5)
+    assert not torch.allclose(code(), code(tracker_m=context.tracker_m + 500.0), atol=1e-3)
+    absent = torch.nan * context.tracker_m
+    assert torch.allclose(code(tracker_m=None), code(tracker_m=absent), atol=1e-6)
+    assert torch.allclose(code(known_goal_m=None), code(known_goal_m=torch.nan * context.known_goal_m), atol=1e-6)
+    assert not torch.allclose(code(), code(known_goal_m=None), atol=1e-3)
+
+
+@pytest.mark.parametrize("sampler", ["ddpm", "ddim", "dpmpp", "few"])
+def test_hypotheses_belong_to_their_window(sampler: str) -> None:
+    cut = windows()
+    config = dataclasses.replace(CONFIG, few_steps=2 if sampler == "few" else 0)
+    found = model(SceneSampling(sampler=sampler, num_steps=3), config).placed(cut.context)  # type: ignore[arg-type]
+    together = found.sample(cut.windows, 3).position_m
+    assert together.shape == (8, 3, 1, 120, 2) and bool(together.isfinite().all())
+    pick = torch.tensor([5, 2])
+    alone = found.placed(cut.context[pick]).sample(cut.windows[pick], 3).position_m
+    assert torch.allclose(alone, together[pick], atol=0.5)
+    step = together.diff(dim=-2).norm(dim=-1)
+    assert float(step.max()) <= CONFIG.max_step_m * 1.0001
+    is_now = cut.windows.detections.time_s[:, 0].gather(1, (cut.windows.detections.count[:, 0] - 1)[:, None])[:, 0] == 0
+    assert bool(is_now.any())
+    assert torch.allclose(
+        together[is_now, :, 0, 0], torch.zeros(1, dtype=torch.float64), atol=1e-6
+    )  # the datum is the detection
+
+
+def test_nothing_is_said_of_windows_without_detections() -> None:
+    rec = recordings()
+    rec.is_detected[rec.offset[1] : rec.offset[2]] = False
+    cut = cut_windows(rec, np.array([1, 2]), np.array([3, 29]), known_start=False)
+    found = model().placed(cut.context).sample(cut.windows, 2)
+    assert bool(found.position_m[0].isnan().all()) and bool(found.position_m[1].isfinite().all())
+    assert found.status == (("no_detections",), ("ok",))
+
+
+@pytest.mark.parametrize("guidance", ["none", "clean", "paper"])
+def test_guidance_and_repair_keep_out_of_obstacles(guidance: str) -> None:
+    circles = torch.tensor([[6500.0, 5000.0, 700.0], [3500.0, 5000.0, 700.0], [5000.0, 6500.0, 700.0]], dtype=torch.float64)
+    walls, cut = Obstacles(circles, ()), windows(24)
+    cut = cut[torch.nonzero((cut.context.datum_m[:, None] - circles[:, :2]).norm(dim=-1).min(dim=1).values > 750.0)[:, 0]]
+    shares = {}
+    for is_repaired in (False, True):
+        sampling = SceneSampling(sampler="ddpm", num_steps=10, guidance=guidance, is_repaired=is_repaired)  # type: ignore[arg-type]
+        found = model(sampling, std=0.05).placed(cut.context, walls).sample(cut.windows, 4).position_m
+        offset = cut.context.datum_m[:, None, None, None]
+        hit = states_in_collision(found, walls, offset_m=offset)
+        crossing = segments_in_collision(found, walls, offset_m=offset)
+        shares[is_repaired] = (float(hit.double().mean()), float(crossing.double().mean()))
+    free = model(SceneSampling(sampler="ddpm", num_steps=10), std=0.05).placed(cut.context).sample(cut.windows, 4).position_m
+    unguided = float(states_in_collision(free, walls, offset_m=cut.context.datum_m[:, None, None, None]).double().mean())
+    assert unguided > 0.01
+    if guidance == "clean":
+        assert shares[False][0] < 0.3 * unguided
+    assert shares[True][0] < 0.02 * unguided and shares[True][1] < 0.02
+
+
+def test_refusals_name_what_to_do() -> None:
+    cut = windows()
+    with pytest.raises(ConfigError, match="step_s = 60"):
+        model().placed(cut.context).sample(dataclasses.replace(cut.windows, time_s=cut.windows.time_s * 2), 2)
+    with pytest.raises(ConfigError, match="not tuned"):
+        model(SceneSampling(sampler="few")).placed(cut.context).sample(cut.windows, 2)
+    with pytest.raises(ValueError, match="placed"):
+        model().sample(cut.windows, 2)
+    with pytest.raises(ValueError, match="ddpm"):
+        SceneSampling(sampler="ddim", guidance="paper")
+    with pytest.raises(ValueError, match="reach"):
+        SceneConfig(num_future=16)
+
+
+def training_windows(num: int = 16) -> SceneWindows:
+    rec, rng = recordings(), np.random.default_rng(2)
+    return scene_windows(rec, rng.integers(0, len(rec.position_m), num), CONFIG, Dropout(), rng)
+
+
+def test_what_is_told_follows_the_shares() -> None:
+    rec, rng = recordings(), np.random.default_rng(3)
+    rows = rng.integers(0, len(rec.position_m), 400)
+    found = scene_windows(rec, rows, CONFIG, Dropout(1.0, 0.25, 0.5), rng)
+    assert len(found) == 400
+    assert abs(float((found.inputs.is_tracker.sum(dim=1) > 0).float().mean()) - 0.5) < 0.1
+    assert len(scene_windows(rec, rows, CONFIG, Dropout(0.0, 0.0, 0.0), rng)) < 400  # before the first detection
+
+
+def test_both_losses_fall_on_one_batch() -> None:
+    batch, config = training_windows(), dataclasses.replace(CONFIG, few_steps=2)
+    for objective in ("diffusion", "energy"):
+        torch.manual_seed(1)
+        network = config.build()
+        adam = torch.optim.Adam(network.parameters(), lr=3e-3)
+        losses = []
+        for step in range(80):
+            generator = torch.Generator().manual_seed(step)
+            if objective == "diffusion":
+                loss = diffusion_loss(network, batch, config, 1.0, generator)
+            else:
+                loss = energy_loss(network, batch, config, 3, (0.3, 0.3), generator)
+            adam.zero_grad()
+            loss.backward()  # type: ignore[no-untyped-call]
+            adam.step()
+            losses.append(float(loss.detach()))
+        assert np.mean(losses[-10:]) < 0.6 * np.mean(losses[:5]), objective
+
+
+def test_the_energy_score_is_the_unbiased_one() -> None:
+    torch.manual_seed(3)
+    found, truth = torch.randn(5, 6, 1, 2).double(), torch.randn(5, 1, 2).double()
+    mine = training._energy_score(found, truth)[:, 0]
+    weight = torch.full((5, 6), 1 / 6, dtype=torch.float64)
+    fair = metrics.energy_score(found[:, :, None], weight, truth[:, None], is_fair=True)[:, 0, 0]
+    assert torch.allclose(mine, fair, atol=1e-4)
+
+
+def test_the_few_steps_of_training_are_those_of_sampling() -> None:
+    cut, config = windows(), dataclasses.replace(CONFIG, few_steps=2)
+    free = dataclasses.replace(model(config=config), sampling=SceneSampling(guidance="none"))
+    free = dataclasses.replace(free, config=dataclasses.replace(config, max_step_m=1e9)).placed(cut.context)
+    drawn = free.sample(cut.windows, 2).position_m[:, :, 0]
+    inputs = scene_inputs(cut.windows, cut.context, config)
+    noise = torch.stack([torch.randn(2, 40, 2, generator=torch.Generator().manual_seed(int(s))) for s in cut.windows.seeds])
+    with torch.no_grad():
+        code = free.network.encode(inputs).repeat_interleave(2, dim=0)
+        pieces = few_step_sample(free.network, inputs.pieces.repeated(2), code, noise.flatten(0, 1), 2)
+    track = to_track(pieces.reshape(8, 2, 40, 2).double(), inputs.pieces, config)
+    assert torch.allclose(future_of(track, config), drawn, atol=0.5)
+
+
+def test_contexts_are_checked() -> None:
+    with pytest.raises(ValueError, match="tracker_m"):
+        Context(torch.zeros(2, 2), tracker_m=torch.zeros(2, 3, 2))
+    assert Context(torch.zeros(4, 2), elapsed_s=torch.arange(4.0))[torch.tensor([2])].elapsed_s == torch.tensor([2.0])
