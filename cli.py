@@ -11,7 +11,7 @@ import typer
 from cadence.errors import CadenceError, UsageError
 from pipeline.config import stage_config
 from pipeline.manifest import StageResult
-from pipeline.missions import is_mission_directory, mission_directories
+from pipeline.missions import mission_directories
 from pipeline.progress import Progress
 from pipeline.summaries import log_record, log_summary, stage_summary, to_json
 
@@ -54,6 +54,8 @@ Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON on 
 Seed = Annotated[
     int | None, typer.Option("--seed", metavar="N", help="Seed of everything random; the same seed repeats the result.")
 ]
+Checkpoint = Annotated[str | None, typer.Option(metavar="NAME", help="Evaluate its forecasts on the logs in MISSION.")]
+ForecastOut = Annotated[Path | None, typer.Option("--out", metavar="DIR", help="For the forecasts' scores; default: MISSION.")]
 
 
 @app.callback(invoke_without_command=True)
@@ -205,26 +207,22 @@ def report(
 
 @app.command()
 def evaluate(
-    mission: Mission, config: Config = None, settings: Set = None, seed: Seed = None, force: Force = False,
-    quiet: Quiet = False, as_json: Json = False,
+    mission: Mission, checkpoint: Checkpoint = None, out: ForecastOut = None, config: Config = None, settings: Set = None,
+    seed: Seed = None, force: Force = False, quiet: Quiet = False, as_json: Json = False,
 ) -> None:  # fmt: skip
-    """Score hypotheses against the truth of the log.
+    """Score hypotheses or forecasts against the truth.
 
-    Beside the rivals: Kalman + RTS, the bank alone, interpolation, hold. A folder of mission directories gets a pooled table.
+    Beside rivals. A folder of missions gets a pooled table; --checkpoint forecasts on a folder of logs, as in the paper.
 
     \b
     Examples:
       cadence evaluate results/flight
-      cadence evaluate results
+      cadence evaluate logs --checkpoint prison --out scores
     """
-    from pipeline.evaluate import EvaluateConfig, evaluate_folder
-    from pipeline.evaluate import evaluate as stage
+    from pipeline.evaluate import EvaluateConfig, evaluate_any
 
     resolved = stage_config(EvaluateConfig, "evaluate", config, settings or (), seed)
-    if is_mission_directory(mission):
-        _show(stage(mission, resolved, Progress(quiet), force), as_json)
-    else:
-        _show(evaluate_folder(mission, resolved, Progress(quiet)), as_json)
+    _show(evaluate_any(mission, checkpoint, out, resolved, Progress(quiet), force), as_json)
 
 
 @app.command()

@@ -1,11 +1,12 @@
 """Score the hypotheses of a mission against its truth, beside the rivals on the same windows.
 
 Reads hypotheses, windows, detections and truth (*.parquet); writes scores.json (everything), scores.csv (the same rows
-for a spreadsheet) and scores.md (what a person reads first). `evaluate_folder` pools the missions of a folder.
+for a spreadsheet) and scores.md (what a person reads first). `evaluate_folder` pools the missions of a folder; a folder of
+logs is evaluated with a forecasting checkpoint (`pipeline.forecasts`).
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +17,11 @@ import torch
 from torch import Tensor
 
 from cadence.constraints.checker import segments_in_collision, states_in_collision
-from cadence.errors import CadenceError, InputError
+from cadence.errors import CadenceError, InputError, UsageError
 from cadence.types import HypothesisSet
+from pipeline.forecasts import ForecastConfig, evaluate_forecasts
 from pipeline.manifest import StageResult, read_manifest, run_stage, write_atomic
+from pipeline.missions import is_mission_directory
 from pipeline.obstacles import OBSTACLES_NAME, read_obstacles
 from pipeline.progress import Progress
 from pipeline.results import MissionHypotheses, read_hypothesis_tables
@@ -40,12 +43,14 @@ class EvaluateConfig:
                      time between truth samples where that is longer
     num_resamples    bootstrap resamples of an interval
     seed             of the rivals' samples and of the bootstrap
+    forecast         how a checkpoint is evaluated on a folder of logs
     """
 
     rivals: tuple[str, ...] = ("bank", "cv", "ou", "linear", "hold")
     max_truth_gap_s: float | None = None
     num_resamples: int = 1000
     seed: int = 0
+    forecast: ForecastConfig = field(default_factory=ForecastConfig)
 
     def __post_init__(self) -> None:
         unknown = [name for name in self.rivals if name not in RIVALS]
@@ -55,6 +60,31 @@ class EvaluateConfig:
             raise ValueError(f"max_truth_gap_s must be positive, got {self.max_truth_gap_s}")
         if self.num_resamples < 1:
             raise ValueError(f"num_resamples must be at least 1, got {self.num_resamples}")
+
+
+def evaluate_any(
+    path: Path, checkpoint: str | None, out: Path | None, config: EvaluateConfig, progress: Progress, force: bool = False
+) -> StageResult:
+    """Score what is at `path`: a mission directory, a folder of them, or with a checkpoint a folder of logs.
+
+    Raises `UsageError` where path and checkpoint do not go together.
+    """
+    is_mission = is_mission_directory(path)
+    if checkpoint is not None:
+        if is_mission or (path.is_file() and path.suffix == ".mcap"):
+            raise UsageError(
+                f"{path}: --checkpoint is for a folder of logs (MCAP) with truth; leave it out, or give the folder"
+            )
+        return evaluate_forecasts(path, checkpoint, out or path, config.forecast, progress, force)
+    if out is not None:
+        raise UsageError("--out is for --checkpoint; the scores of missions are written beside them")
+    if is_mission:
+        return evaluate(path, config, progress, force)
+    if not any(path.glob("*/hypotheses.parquet")) and any(path.glob("*.mcap")):
+        raise UsageError(
+            f"{path}: holds logs, not missions; forecast with --checkpoint NAME, or call cadence run on them first"
+        )
+    return evaluate_folder(path, config, progress)
 
 
 def evaluate(directory: Path, config: EvaluateConfig, progress: Progress, force: bool = False) -> StageResult:

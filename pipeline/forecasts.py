@@ -1,0 +1,267 @@
+"""Evaluate forecasts by the paper's protocol: random moments of many episodes, thirty hypotheses of the next two hours.
+
+At a moment (episode, step) the detections up to it are known; the 120 positions from it on are asked for (after its end the
+target stays where it was) and scored at the steps 0, 29, 59, 89 and 119 (`pipeline.forecast_scores`). The windows are
+scored in blocks that are kept, so that a killed call goes on where it was.
+"""
+
+import dataclasses
+import functools
+import hashlib
+import json
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from cadence.diffusion.absolute import AbsoluteSampling
+from cadence.errors import ConfigError, InputError
+from cadence.types import Estimator, HypothesisSet, WindowBatch
+from cadence.worlds.recordings import ForecastWindows, Recordings, choose_windows, cut_windows
+from pipeline.checkpoints import checkpoint_hash, find_checkpoint
+from pipeline.config import config_as_dict
+from pipeline.forecast_scores import HORIZONS, EpisodeScores, score_forecasts
+from pipeline.forecast_tables import ForecastFacts, as_csv, as_json, as_markdown, headline, pool
+from pipeline.forecasters import FORECAST_RIVALS, Forecaster, RivalData, label_of, load_forecaster
+from pipeline.manifest import StageResult, hash_file, run_stage, write_atomic
+from pipeline.progress import Progress
+from pipeline.provenance import versions
+from pipeline.recordings import RecordingsConfig, RecordingSet, load_recordings
+
+STAGE = "forecast"
+BLOCK = 200
+"""Windows that are sampled and scored at once, and kept."""
+
+SCORES_FORMAT = 1
+"""Of the kept blocks."""
+
+
+@dataclass(frozen=True)
+class ForecastConfig:
+    """How the forecasts of a checkpoint are evaluated on a folder of logs.
+
+    num_windows     random moments of random episodes, every step of every episode equally likely
+    num_hypotheses  for each of them
+    known_start     the target's first position counts as a detection, as in the paper
+    known_goal      a goal that the searching side knows of is told to estimators that read it
+    trackers        so are the positions of the trackers
+    rivals          out of `pipeline.forecasters.FORECAST_RIVALS`, scored on the same windows
+    checkpoints     further ones, scored beside: files or shipped names
+    num_resamples   bootstrap resamples of an interval, over episodes
+    seed            of the choice of windows, of the hypotheses and of the bootstrap
+    recordings      how episodes are read from the logs; the folder of the call is its data
+    training        episodes that rivals may learn from; without it none
+    paper           how checkpoints of the preset "paper" are sampled
+    """
+
+    num_windows: int = 2000
+    num_hypotheses: int = 30
+    known_start: bool = True
+    known_goal: bool = True
+    trackers: bool = True
+    rivals: tuple[str, ...] = ("cv",)
+    checkpoints: tuple[str, ...] = ()
+    num_resamples: int = 1000
+    seed: int = 0
+    recordings: RecordingsConfig = field(default_factory=RecordingsConfig)
+    training: RecordingsConfig | None = None
+    paper: AbsoluteSampling = field(default_factory=AbsoluteSampling)
+
+    def __post_init__(self) -> None:
+        unknown = [name for name in self.rivals if name not in FORECAST_RIVALS]
+        if unknown:
+            raise ValueError(f"rival {unknown[0]!r} is not known; known rivals: {', '.join(FORECAST_RIVALS)}")
+        if min(self.num_windows, self.num_hypotheses, self.num_resamples) < 1 or self.seed < 0:
+            raise ValueError("num_windows, num_hypotheses and num_resamples must be at least 1, seed not negative")
+
+
+@dataclass(frozen=True)
+class _Key:
+    """What a result depends on beside the checkpoints' files."""
+
+    forecast: ForecastConfig
+    checkpoint: str
+    logs: str
+
+
+def evaluate_forecasts(
+    folder: Path, checkpoint: str, out: Path, config: ForecastConfig, progress: Progress, force: bool = False
+) -> StageResult:
+    """Score a checkpoint's forecasts on the logs in `folder`; writes forecast.json, .csv and .md into `out`.
+
+    Raises `InputError` where no log can be used, `ConfigError` for a checkpoint that is not there or does not forecast.
+    """
+    names = tuple(dict.fromkeys([checkpoint, *config.checkpoints]))
+    forecasters = {label_of(name): load_forecaster(name, config.paper) for name in names}
+    if len(forecasters) < len(names):
+        raise ConfigError(f"evaluate.forecast.checkpoints: two of {', '.join(names)} have the same name; rename one")
+    source = dataclasses.replace(config.recordings, data=folder)
+    logs = sorted(folder.glob(source.pattern)) if folder.is_dir() else []
+    digest = hashlib.sha256("".join(f"{log.name} {hash_file(log)}\n" for log in logs).encode()).hexdigest()
+    weights = [find_checkpoint(name) for name in names]
+
+    def body(work: Path) -> Mapping[str, Any]:
+        # Beside the results, not inside the working folder: what a killed call has done is to be found again.
+        cache = out / "cache"
+        episodes = load_recordings(source, cache, progress)
+        training = None if config.training is None else load_recordings(config.training, cache, progress).recordings
+        windows = forecast_windows(episodes.recordings, config)
+        run = ForecastRun(episodes, windows, config.num_hypotheses, cache / "scores", progress)
+        data = RivalData(episodes.recordings, training, config.known_start)
+        scores = {
+            label: run.score(label, functools.partial(_same, forecasters[label]), [checkpoint_hash(path), config.paper])
+            for label, path in zip(forecasters, weights, strict=True)
+        }
+        for name in config.rivals:
+            scores[name] = run.score(name, functools.partial(FORECAST_RIVALS[name], data), [name, config.training])
+        report = pool(scores, truth_scores(episodes, windows), facts_of(episodes, windows, config), config.num_resamples)
+        write_atomic(work / "forecast.json", as_json(report))
+        write_atomic(work / "forecast.csv", as_csv(report))
+        write_atomic(work / "forecast.md", as_markdown(report))
+        counts = {"num_episodes": len(episodes.recordings), "num_left_out": len(episodes.left_out), "num_windows": len(windows)}
+        return {**counts, "scores": headline(report)}
+
+    if not logs:
+        load_recordings(source, out / "cache", progress)  # says what is wrong
+    inputs = [item for path in weights for item in (path, path.with_suffix(".json"))]
+    key = _Key(config, ",".join(names), digest)
+    return run_stage(STAGE, out, config=key, inputs=inputs, body=body, force=force)
+
+
+def _same(forecaster: Forecaster) -> Forecaster:
+    return forecaster
+
+
+def forecast_windows(recordings: Recordings, config: ForecastConfig) -> ForecastWindows:
+    """The windows of an evaluation. `InputError` where nothing is known anywhere."""
+    if not (config.known_start or recordings.is_detected.any()):
+        raise InputError("no log has a detection, and the start is not known (evaluate.forecast.known_start)")
+    rng = np.random.default_rng([config.seed, 20])
+    episode, step = choose_windows(recordings, config.num_windows, rng, config.known_start)
+    windows = cut_windows(recordings, episode, step, known_start=config.known_start, seed=config.seed)
+    context = windows.context
+    if not config.known_goal:
+        nothing = torch.full((len(windows), 1, 2), torch.nan, dtype=torch.float64)
+        context = dataclasses.replace(context, known_goal_m=nothing)
+    if not config.trackers and context.tracker_m is not None:
+        context = dataclasses.replace(context, tracker_m=torch.full_like(context.tracker_m, torch.nan))
+    return dataclasses.replace(windows, context=context)
+
+
+@dataclass(frozen=True, eq=False)
+class ForecastRun:
+    """Windows of some episodes, and where the scores of their blocks are kept.
+
+    cache  a folder; None: nothing is kept
+    """
+
+    episodes: RecordingSet
+    windows: ForecastWindows
+    num_hypotheses: int
+    cache: Path | None
+    progress: Progress
+
+    @functools.cached_property
+    def content(self) -> str:
+        """Hash of all that is asked and known."""
+        windows, context = self.windows, self.windows.context
+        values = [*vars(self.episodes.recordings).values(), windows.episode, windows.step, windows.windows.seeds]
+        values += [windows.windows.detections.is_observed, context.known_goal_m, context.tracker_m]
+        found = hashlib.sha256()
+        for value in values:
+            found.update(np.ascontiguousarray(value).tobytes())
+        texts: dict[int, str] = {}
+        for item in self.episodes.obstacles:
+            if id(item) not in texts:
+                texts[id(item)] = repr([item.circle_array.tolist(), [shape.wkt for shape in item.shapes]])
+        found.update(repr([texts[id(item)] for item in self.episodes.obstacles]).encode())
+        return found.hexdigest()
+
+    def score(self, label: str, build: Callable[[], Forecaster], identity: list[object]) -> EpisodeScores:
+        """Scores of a forecaster, which is built only where a block is not kept already.
+
+        `identity` is what its answers depend on: names, hashes, configurations.
+        """
+        plain = [config_as_dict(item) if dataclasses.is_dataclass(item) else item for item in identity]
+        key = json.dumps([plain, self.content, self.num_hypotheses, versions(), SCORES_FORMAT], sort_keys=True, default=str)
+        stem = f"{label}-{hashlib.sha256(key.encode()).hexdigest()[:24]}"
+        forecaster: Forecaster | None = None
+        parts = []
+        with self.progress.bar(len(self.windows), label, unit="window") as bar:
+            for begin in range(0, len(self.windows), BLOCK):
+                part = self.windows[begin : begin + BLOCK]
+                path = None if self.cache is None else self.cache / f"{stem}-{begin:06d}.json"
+                found = _kept(path)
+                if found is None:
+                    forecaster = forecaster or build()
+                    found = self._score_block(forecaster, part)
+                    if path is not None:
+                        write_atomic(path, found.as_json())
+                parts.append(found)
+                bar.update(len(part))
+        return EpisodeScores.add(parts)
+
+    def _score_block(self, forecaster: Forecaster, part: ForecastWindows) -> EpisodeScores:
+        begin = time.process_time()
+        estimator = forecaster.placed(part.context)
+        found = estimator.sample(part.windows, self.num_hypotheses)
+        seconds = time.process_time() - begin
+        num_lost = int((~torch.isfinite(found.position_m)).flatten(1).any(dim=1).sum())
+        if num_lost:
+            raise ConfigError(
+                f"{forecaster.name}: no position for {num_lost} of {len(part)} windows; does it need a known goal "
+                "or trackers that the logs do not have? See evaluate.forecast"
+            )
+        obstacles = [self.episodes.obstacles[index] for index in part.episode.tolist()]
+        paper = paper_error(estimator, part.windows, part.truth_m)
+        return score_forecasts(found, part.truth_m, part.episode, part.context.datum_m, obstacles, paper, seconds)
+
+
+def paper_error(estimator: Estimator, windows: WindowBatch, truth_m: Tensor) -> Tensor | None:
+    """The measure sum_k pi_k |mu_k - y| [B, H] of an estimator that answers with mixtures; None for others."""
+    mixture = getattr(estimator, "mixture", None)
+    if mixture is None:
+        return None
+    error: Tensor = mixture(windows).expected_distance(truth_m[:, 0, list(HORIZONS)])
+    return error
+
+
+def _kept(path: Path | None) -> EpisodeScores | None:
+    """The scores in a file; None where there are none, or none that can be read."""
+    if path is None:
+        return None
+    try:
+        return EpisodeScores.from_json(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, LookupError, TypeError):
+        return None
+
+
+def truth_scores(episodes: RecordingSet, windows: ForecastWindows) -> EpisodeScores:
+    """The truth scored as if it were a forecast of one hypothesis: how long its steps are, and how often it is in obstacles."""
+    status = tuple(("ok",) for _ in range(len(windows)))
+    weight = torch.ones(len(windows), 1, dtype=torch.float64)
+    obstacles = [episodes.obstacles[index] for index in windows.episode.tolist()]
+    found = HypothesisSet(windows.truth_m[:, None], weight, status)
+    return score_forecasts(found, windows.truth_m, windows.episode, windows.context.datum_m, obstacles)
+
+
+def facts_of(episodes: RecordingSet, windows: ForecastWindows, config: ForecastConfig) -> ForecastFacts:
+    """What a reader of the tables must know."""
+    return ForecastFacts(
+        num_episodes=len(episodes.recordings),
+        num_left_out=len(episodes.left_out),
+        left_out=episodes.left_out,
+        num_windows=len(windows),
+        num_hypotheses=config.num_hypotheses,
+        detection_rate=float(episodes.recordings.rates().mean()),
+        step_s=episodes.recordings.step_s,
+        scale_m=episodes.scale_m,
+        known_start=config.known_start,
+        known_goal=config.known_goal and bool(np.isfinite(episodes.recordings.known_goal_m).any()),
+        seed=config.seed,
+    )
