@@ -33,8 +33,8 @@ Rival = Literal["vrnn", "grammi_without_mi", "grammi"]
 RIVALS: tuple[Rival, ...] = ("vrnn", "grammi_without_mi", "grammi")
 """Presets of this module."""
 
-_BLOCK_WINDOWS = 4096
-"""Windows cut at once: cutting has a fixed cost that goes with the recordings."""
+_BATCHES_A_BLOCK = 32
+"""Batches cut at once: cutting has a fixed cost that goes with the recordings."""
 _VALIDATION_STREAM = 500_009
 _MARGIN = 1.02
 """Map limits taken from the recordings get this much room."""
@@ -236,14 +236,13 @@ class _Source:
         batch_size: int,
     ) -> None:
         self.seed, self.batch_size = seed, batch_size
-        self.batches_a_block = max(1, _BLOCK_WINDOWS // batch_size)
         self.cut = functools.partial(_cut, recordings, frame, history, horizons)
         self.block: tuple[int, MixtureWindows] | None = None
 
     def batch(self, step: int) -> MixtureWindows:
-        number, index = divmod(step, self.batches_a_block)
+        number, index = divmod(step, _BATCHES_A_BLOCK)
         if self.block is None or self.block[0] != number:
-            self.block = number, self.cut(self.batches_a_block * self.batch_size, [self.seed, number])
+            self.block = number, self.cut(_BATCHES_A_BLOCK * self.batch_size, [self.seed, number])
         return self.block[1][slice(index * self.batch_size, (index + 1) * self.batch_size)]
 
 

@@ -14,9 +14,9 @@ from torch.nn.utils.rnn import pack_padded_sequence
 
 from cadence.baselines.grammi import MixtureDecoder, check_horizons
 from cadence.baselines.mixture import HORIZONS, HistoryConfig, MixtureInputs, RawMixture
+from cadence.baselines.recurrence import previous_rows, run_recurrence, spread
 
 _NUM_FEATURES = 3
-_MIN_SIGMA = 1e-4
 
 
 def _without_trackers() -> HistoryConfig:
@@ -81,58 +81,42 @@ class VrnnNetwork(nn.Module):
         order = torch.argsort(count, descending=True, stable=True)
         back = torch.argsort(order)
         packed = pack_padded_sequence(inputs.rows[order], count[order], batch_first=True)
-        drawn = None if noise is None else pack_padded_sequence(noise[order], count[order], batch_first=True).data
         sizes = packed.batch_sizes.tolist()
-        code, moments, before = self._run(self.of_detection(packed.data), drawn, sizes)
+        drawn = packed.data.new_zeros(len(packed.data), self.latent_size)
+        if noise is not None:
+            drawn = pack_padded_sequence(noise[order], count[order], batch_first=True).data
+        moments, features, states = self._run(self.of_detection(packed.data), drawn, sizes)
+        before = torch.cat([states.new_zeros(sizes[0], states.shape[1]), states[previous_rows(sizes)]])
         divergence = _divergence(moments, self.prior(before))
         row = torch.cat([torch.arange(size) for size in sizes])
         summed = divergence.new_zeros(len(inputs)).index_add(0, row, divergence)
-        code = torch.cat([code[back], inputs.extra(self.history)], dim=-1)
+        begin = torch.tensor([0, *sizes]).cumsum(0)
+        last = (begin[count[order] - 1] + torch.arange(len(inputs)))[back]
+        code = torch.cat([features[last], states[last], inputs.extra(self.history)], dim=-1)
         return self.decoder(code[:, None].expand(-1, len(self.horizons), -1)), summed[back]
 
-    def _run(self, features: Tensor, noise: Tensor | None, sizes: list[int]) -> tuple[Tensor, Tensor, Tensor]:
-        """Through all detections, packed: step by step, the rows that still have one.
-
-        Returns:
-            (last latent feature, last state) of every row [R, 2 h]; the posterior's moments at every detection [P, 2 z]; the
-            state before it [P, h].
-        """
-        h, z = self.config.hidden_size, self.config.latent_size
+    def _run(self, features: Tensor, noise: Tensor, sizes: list[int]) -> tuple[Tensor, Tensor, Tensor]:
+        """Through all detections, packed: the posterior's moments [P, 2 z], features of latents [P, h], states after [P, h]."""
+        h = self.config.hidden_size
         of_features = functional.linear(features, self.posterior_in.weight[:, :h], self.posterior_in.bias)
         gates_of_features = functional.linear(features, self.recurrence_in.weight[:, :h])
-        from_state = torch.cat([self.posterior_in.weight[:, h:], self.recurrence.weight]).t()
-        from_latent = self.recurrence_in.weight[:, h:].t()
-        out_weight, out_bias = self.posterior_out.weight.t(), self.posterior_out.bias
-        state = features.new_zeros(sizes[0], h)
-        before, moments, ended = [], [], []
-        noises = [None] * len(sizes) if noise is None else list(torch.split(noise, sizes))
-        steps = zip(
-            torch.split(of_features, sizes), torch.split(gates_of_features, sizes), noises, [*sizes[1:], 0], strict=True
+        weights = (
+            torch.cat([self.posterior_in.weight[:, h:], self.recurrence.weight]).t(),
+            self.posterior.weight.t(),
+            self.posterior.bias,
+            self.posterior_out.weight.t(),
+            self.posterior_out.bias,
+            self.of_latent.weight.t(),
+            self.of_latent.bias,
+            self.recurrence_in.weight[:, h:].t(),
         )
-        for of_feature, of_gates, drawn, left in steps:
-            to_posterior, to_gates = torch.split(state @ from_state, [h, 3 * h], dim=1)
-            hidden = functional.relu(self.posterior(functional.relu(of_feature + to_posterior)))
-            moment = torch.addmm(out_bias, hidden, out_weight)
-            latent = moment[:, :z]
-            if drawn is not None:
-                latent = latent + (functional.softplus(moment[:, z:]) + _MIN_SIGMA) * drawn
-            feature = functional.relu(self.of_latent(latent))
-            gates = torch.addmm(of_gates, feature, from_latent)
-            reset, update = torch.sigmoid(gates[:, : 2 * h] + to_gates[:, : 2 * h]).chunk(2, dim=1)
-            proposed = torch.tanh(gates[:, 2 * h :] + reset * to_gates[:, 2 * h :])
-            before.append(state)
-            moments.append(moment)
-            state = torch.lerp(proposed, state, update)
-            if left < len(state):
-                ended.append(torch.cat([feature[left:], state[left:]], dim=1))
-                state = state[:left]
-        return torch.cat(ended[::-1]), torch.cat(moments), torch.cat(before)
+        return run_recurrence(of_features, gates_of_features, noise, weights, sizes)
 
 
 def _divergence(posterior: Tensor, prior: Tensor) -> Tensor:
     """Of Gaussians given as (mean, sigma before the softplus) [P, 2 z], summed over z: [P]."""
     mean, raw = posterior.chunk(2, dim=-1)
     other_mean, other_raw = prior.chunk(2, dim=-1)
-    sigma, other = functional.softplus(raw) + _MIN_SIGMA, functional.softplus(other_raw) + _MIN_SIGMA
+    sigma, other = spread(raw), spread(other_raw)
     terms = 2.0 * (other / sigma).log() + (sigma.square() + (mean - other_mean).square()) / other.square() - 1.0
     return 0.5 * terms.sum(dim=-1)

@@ -19,6 +19,7 @@ from cadence.baselines.mixture import (
     mixture_inputs,
     straight_tracks,
 )
+from cadence.baselines.recurrence import run_recurrence
 from cadence.baselines.vrnn import VrnnNetwork, VrnnNetworkConfig
 from cadence.errors import ConfigError
 from cadence.network.encoder import DetectionEncoder
@@ -268,6 +269,16 @@ def test_vrnn_steps_are_the_recurrence_written_plainly():
         expected = network.decoder(code.expand(1, 5, -1))
         torch.testing.assert_close(raw.mean[row], expected.mean[0], atol=1e-5, rtol=1e-4)
         torch.testing.assert_close(divergence[row], total, atol=1e-4, rtol=1e-4)
+
+
+@pytest.mark.parametrize("sizes", [[4], [3, 3, 2, 1], [5, 1, 1]])
+def test_the_gradient_of_the_recurrence_is_that_of_finite_differences(sizes):
+    stream = torch.Generator().manual_seed(3)
+    h, z, p = 3, 2, sum(sizes)
+    shapes = [(p, h), (p, 3 * h), (p, z), (h, 4 * h), (h, h), (h,), (h, 2 * z), (2 * z,), (z, h), (h,), (h, 3 * h)]
+    values = [torch.randn(shape, generator=stream, dtype=torch.float64) for shape in shapes]
+    given = [value.requires_grad_(index != 2) for index, value in enumerate(values)]
+    assert torch.autograd.gradcheck(lambda f, g, e, *weights: run_recurrence(f, g, e, weights, sizes), given)
 
 
 def test_the_posterior_is_paid_for_naming_the_component():
