@@ -26,7 +26,7 @@ DEFAULT = "general"
 class CheckpointInfo:
     """The JSON beside the weights.
 
-    preset    "general" or "paper"
+    preset    "general", "paper", "scene", or a rival's
     network   the network's configuration
     training  command, seed, steps and data that made it
     scores    what validation measured

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import pyarrow as pa
+import pyarrow.compute as pc
 import torch
 from torch import Tensor
 
@@ -19,15 +20,18 @@ from cadence.diffusion.absolute import AbsoluteSampling
 from cadence.diffusion.feasible import Feasibility, resampled
 from cadence.diffusion.gate import gated
 from cadence.diffusion.general import GeneralModel
+from cadence.diffusion.scene import SceneSampling
 from cadence.errors import ConfigError, DeviceError
 from cadence.network.residual import ResidualNetwork, ResidualNetworkConfig
 from cadence.types import Detections, WindowBatch
 from pipeline.absolute import absolute_grid, draw_absolute, load_absolute
 from pipeline.checkpoints import DEFAULT, checkpoint_hash, find_checkpoint, load_weights, network_config, read_info
 from pipeline.hypothesis_tables import hypothesis_rows, window_rows
+from pipeline.ingest import CATALOGUE_NAME, read_catalogue
 from pipeline.manifest import StageResult, run_stage
 from pipeline.obstacles import read_obstacles
 from pipeline.progress import Progress
+from pipeline.scene import draw_scene, load_scene, scene_grid
 from pipeline.tables import read_table, write_table
 from pipeline.windows import Grid, GridConfig, MissionWindows, build_windows, fit_tracks, later_detections, plan_grid
 
@@ -65,6 +69,7 @@ class InferConfig:
     default_sigma_m  accuracy of detections that state none
     device           "auto", "cpu" or "cuda"
     paper            how a checkpoint of the paper preset is sampled; it brings its own grid
+    scene            how a checkpoint of the scene preset is sampled; it brings its own grid
     is_gated         the network moves all, half or none of the hypotheses, as withheld detections of this log advise
     """
 
@@ -79,6 +84,7 @@ class InferConfig:
     grid: GridConfig = field(default_factory=GridConfig)
     guidance: GuidanceConfig = field(default_factory=GuidanceConfig)
     paper: AbsoluteSampling = field(default_factory=AbsoluteSampling)
+    scene: SceneSampling = field(default_factory=SceneSampling)
 
     def __post_init__(self) -> None:
         if self.num_hypotheses < 1 or self.num_steps < 1 or self.default_sigma_m < 0:
@@ -95,7 +101,7 @@ def infer(directory: Path, config: InferConfig, progress: Progress, force: bool 
     detections, frame = read_table(inputs[0], "detections")
 
     def body(folder: Path) -> dict[str, Any]:
-        plan = _plan(config, detections, read_obstacles(inputs[1]), weights)
+        plan = _plan(config, detections, read_obstacles(inputs[1]), weights, _mission_start_ns(directory, detections))
         log_id = str(detections["log_id"][0])
         parts, statuses = [], []
         with progress.bar(plan.windows.batch.num_windows, "infer", unit="window") as bar:
@@ -132,9 +138,24 @@ class _Plan:
     about: dict[str, Any]
 
 
-def _plan(config: InferConfig, detections: pa.Table, obstacles: Obstacles, weights: Path | None) -> _Plan:
+def _mission_start_ns(directory: Path, detections: pa.Table) -> int:
+    """When the log begins; without a catalogue the first detection."""
+    if (directory / CATALOGUE_NAME).is_file():
+        return read_catalogue(directory).start_ns
+    return int(pc.min(detections["time_ns"]).as_py() or 0)
+
+
+def _plan(config: InferConfig, detections: pa.Table, obstacles: Obstacles, weights: Path | None, start_ns: int) -> _Plan:
     """The draws by the preset of the checkpoint, which decides the grid as well."""
-    if weights is not None and read_info(weights).preset == "paper":
+    preset = None if weights is None else read_info(weights).preset
+    if weights is not None and preset == "scene":
+        scene = load_scene(weights, config.scene)
+        grid = plan_grid(detections, scene_grid(scene.config, config.grid.stride_steps))
+        windows = build_windows(detections, grid, config.seed, config.default_sigma_m)
+        limits = Obstacles.none() if config.guidance.mode == "none" else obstacles
+        draws = draw_scene(scene, windows, start_ns, config.num_hypotheses, limits)
+        return _Plan(grid, windows, draws, {"preset": "scene"})
+    if weights is not None and preset == "paper":
         paper = load_absolute(weights, config.paper)
         grid = plan_grid(detections, absolute_grid(paper.config, config.grid.stride_steps))
         windows = build_windows(detections, grid, config.seed, config.default_sigma_m)

@@ -64,9 +64,9 @@ class SceneSampling:
 
 @dataclass(frozen=True, eq=False)
 class SceneModel:
-    """A trained network as an `Estimator` for windows of one agent that begin now; `placed` binds their context.
+    """A trained network as an `Estimator` for windows that begin now; `placed` binds their context.
 
-    Windows without detections are NaN. `obstacles` lie in the mission frame.
+    Agents are independent of each other; those without detections are NaN. `obstacles` lie in the mission frame.
     """
 
     network: SceneNetwork
@@ -86,16 +86,15 @@ class SceneModel:
 
     @torch.no_grad()
     def sample(self, windows: WindowBatch, num_hypotheses: int) -> HypothesisSet:
-        """Hypotheses [B, K, 1, T, 2]; a window's depend on its seed, not on its neighbours. `ConfigError` for other grids."""
+        """Hypotheses [B, K, A, T, 2]; a window's depend on its seed, not on its neighbours. `ConfigError` for other grids."""
         self._check(windows)
         assert self.context is not None
-        active = windows.is_active[:, 0]
-        known, context = windows[active], self.context[active]
+        rows, context = _one_agent_a_row(windows, self.context)
         per_chunk = max(1, self.sampling.chunk // num_hypotheses)
         parts = [torch.zeros(0, num_hypotheses, NUM_STEPS, 2, dtype=torch.float64)]
-        for begin in range(0, known.num_windows, per_chunk):
-            rows = slice(begin, begin + per_chunk)
-            parts.append(self._sample_rows(known[rows], context[rows], num_hypotheses))
+        for begin in range(0, rows.num_windows, per_chunk):
+            part = slice(begin, begin + per_chunk)
+            parts.append(self._sample_rows(rows[part], context[part], num_hypotheses))
         return scatter_hypotheses(torch.cat(parts), windows)
 
     def _check(self, windows: WindowBatch) -> None:
@@ -104,10 +103,6 @@ class SceneModel:
             raise ConfigError(
                 f"infer.grid: this checkpoint predicts {NUM_STEPS} steps of {step_s:g} s from now on; set step_s = {step_s:g}, "
                 f"history_steps = 1, horizon_steps = {NUM_STEPS - 1}"
-            )
-        if windows.num_agents != 1:
-            raise ConfigError(
-                f"infer: this checkpoint knows one target, the log has {windows.num_agents}; use another checkpoint"
             )
         if self.context is None or len(self.context.datum_m) != windows.num_windows:
             raise ValueError("SceneModel: the windows need a context of their own; use placed()")
@@ -188,6 +183,18 @@ class _Tracks:
             return cost.cost(to_track(displacement, self.pieces, self.config) + self.last_m)
 
         return adam_guidance(mean, cost_of, self.sampling.learning_rate, self.sampling.iterations)
+
+
+def _one_agent_a_row(windows: WindowBatch, context: Context) -> tuple[WindowBatch, Context]:
+    """Every active agent of every window as a window of its own."""
+    window, agent = windows.is_active.nonzero(as_tuple=True)
+    d = windows.detections
+    columns = (d.time_s, d.position_m, d.covariance_m2, d.is_observed)
+    seeds = windows.seeds[window] + 7_919 * agent
+    rows = WindowBatch(windows.time_s, Detections(*(value[window, agent][:, None] for value in columns)), seeds, 0)
+    goal = context.known_goal_m
+    mine = dataclasses.replace(context[window], known_goal_m=None if goal is None else goal[window, agent][:, None])
+    return rows, mine
 
 
 def _last_detection(detections: Detections) -> Tensor:
