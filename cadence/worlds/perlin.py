@@ -23,10 +23,8 @@ _PERMUTATION = """
 _TABLE = np.tile(np.array(_PERMUTATION.split(), dtype=np.int64), 3)
 # The gradients of the noise in three dimensions, cut to the plane: twelve edges of a cube, four of them twice.
 _GRADIENTS = np.array(
-    [(1, 1), (-1, 1), (1, -1), (-1, -1), (1, 0), (-1, 0), (1, 0), (-1, 0)]
-    + [(0, 1), (0, -1), (0, 1), (0, -1), (1, 0), (-1, 0), (0, -1), (0, 1)],
-    dtype=np.float32,
-)
+    "1 1  -1 1  1 -1  -1 -1  1 0  -1 0  1 0  -1 0  0 1  0 -1  0 1  0 -1  1 0  -1 0  0 -1  0 1".split(), dtype=np.float32
+).reshape(16, 2)
 
 
 def octave(x: Array32, y: Array32, period: np.float32, base: int) -> Array32:
@@ -38,7 +36,12 @@ def octave(x: Array32, y: Array32, period: np.float32, base: int) -> Array32:
     row, next_row, along, blend_y = _axis(y, period, base)
     u, v = across[:, None], along[None, :]
     corners = []
-    for i, j, du, dv in ((column, row, 0, 0), (next_column, row, 1, 0), (column, next_row, 0, 1), (next_column, next_row, 1, 1)):
+    for i, j, du, dv in (
+        (column, row, 0, 0),
+        (next_column, row, 1, 0),
+        (column, next_row, 0, 1),
+        (next_column, next_row, 1, 1),
+    ):
         gradient = _GRADIENTS[_TABLE[_TABLE[_TABLE[i][:, None] + j[None, :]]] & 15]
         corners.append((u - np.float32(du)) * gradient[..., 0] + (v - np.float32(dv)) * gradient[..., 1])
     low = corners[0] + blend_x[:, None] * (corners[1] - corners[0])
@@ -81,7 +84,7 @@ def _axis(x: Array32, period: np.float32, base: int) -> tuple[NDArray[np.int64],
     """Lattice line below, the one above, place between them and its smooth blend, of coordinates `x` [X]."""
     cell = np.floor(np.fmod(x, period)).astype(np.int64)
     above = np.fmod(cell + 1, period).astype(np.int64)
-    place = (x - np.floor(x)).astype(np.float32)
+    place: Array32 = (x - np.floor(x)).astype(np.float32)
     six, fifteen, ten = np.float32(6), np.float32(15), np.float32(10)
     blend = place * place * place * (place * (place * six - fifteen) + ten)
-    return (cell & 255) + base, (above & 255) + base, place, blend
+    return (cell & 255) + base, (above & 255) + base, place, blend.astype(np.float32)

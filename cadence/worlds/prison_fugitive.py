@@ -288,7 +288,8 @@ def _first(is_seen: Bools, length: Array) -> tuple[Bools, Array]:
     """Whether any tracker [N, K] is seen, and the distance [N] to the first of them that is."""
     if not is_seen.shape[1]:
         return np.zeros(len(is_seen), dtype=bool), np.full(len(is_seen), np.inf)
-    return is_seen.any(axis=1), length[np.arange(len(length)), is_seen.argmax(axis=1)]
+    any_seen: Bools = np.any(is_seen, axis=1)
+    return any_seen, length[np.arange(len(length)), is_seen.argmax(axis=1)]
 
 
 def _avoid(here: Array, speed: Array, heading: Array) -> tuple[Array, Array]:

@@ -25,27 +25,38 @@ MOUNTAIN = (1600.0, 1800.0)
 KEEP_OUT = 140.0
 """Movers that come nearer to the centre of the mountain turn straight away from it."""
 
-KNOWN_SITES: Ints = np.array(
-    [(323, 1623), (1804, 737), (317, 2028), (819, 1615), (1145, 182), (1304, 624), (234, 171), (2398, 434), (633, 2136), (1590, 2)]
-)
+
+def _cells(text: str) -> Ints:
+    """Cells [N, 2] from numbers in a text."""
+    return np.array(text.split(), dtype=np.int64).reshape(-1, 2)
+
+
+KNOWN_SITES = _cells("323 1623  1804 737  317 2028  819 1615  1145 182  1304 624  234 171  2398 434  633 2136  1590 2")
 """Places of hideouts that the trackers know; an episode has one of them."""
-UNKNOWN_SITES: Ints = np.array(
-    [(376, 1190), (909, 510), (397, 798), (2059, 541), (2011, 103), (901, 883), (1077, 1445), (602, 372), (80, 2274), (279, 477)]
-)
+UNKNOWN_SITES = _cells("376 1190  909 510  397 798  2059 541  2011 103  901 883  1077 1445  602 372  80 2274  279 477")
 """Places of hideouts that the trackers do not know; an episode has two of them."""
 
-_FOREST_CAMERAS = (
-    [(1000, 800), (1400, 400), (1750, 1800), (1580, 1200), (2200, 2200), (1900, 1632), (1800, 1525), (1700, 1300)]
-    + [(1600, 1415), (1500, 1202), (1432, 200), (1535, 900), (1742, 851), (1805, 765), (1922, 696), (2200, 2200)]
+_FOREST_CAMERAS = _cells(
+    """
+    1000 800  1400 400  1750 1800  1580 1200  2200 2200  1900 1632  1800 1525  1700 1300
+    1600 1415  1500 1202  1432 200  1535 900  1742 851  1805 765  1922 696  2200 2200
+    """
 )
-_FENCE_CAMERAS = [(2028, y) for y in range(2398, 2037, -30)] + [(2028, 2028)] + [(x, 2028) for x in range(2398, 2037, -30)]
-SEEN_CAMERAS: Ints = np.array(_FOREST_CAMERAS + _FENCE_CAMERAS)
+_FENCE = np.append(np.arange(2398, 2037, -30), 2028)
+SEEN_CAMERAS = np.concatenate(
+    [
+        _FOREST_CAMERAS,
+        np.stack([np.full_like(_FENCE, 2028), _FENCE], axis=-1),
+        np.stack([_FENCE[:-1], np.full_like(_FENCE[:-1], 2028)], axis=-1),
+    ]
+)
 """Cameras that the fugitive knows; an episode has two more of them, at the start and at the known hideout."""
-HIDDEN_CAMERAS: Ints = np.array(
-    [(2000, 2400), (1800, 200), (1000, 1600), (110, 1200), (1400, 2000), (1876, 1903), (207, 949), (667, 2380), (311, 768)]
-    + [(323, 1334), (77, 1440), (1718, 892), (1596, 628), (659, 1805), (1228, 101), (1111, 1319), (1894, 926), (1778, 2118)]
-    + [(790, 802), (1261, 598), (2183, 2324), (750, 149), (588, 663), (1601, 55), (1499, 1722), (1491, 2294), (39, 804)]
-    + [(2400, 1000), (2300, 1250), (2366, 2148), (2125, 1330), (1028, 2063), (2340, 300)]
+HIDDEN_CAMERAS = _cells(
+    """
+    2000 2400  1800 200  1000 1600  110 1200  1400 2000  1876 1903  207 949  667 2380  311 768  323 1334  77 1440
+    1718 892  1596 628  659 1805  1228 101  1111 1319  1894 926  1778 2118  790 802  1261 598  2183 2324  750 149
+    588 663  1601 55  1499 1722  1491 2294  39 804  2400 1000  2300 1250  2366 2148  2125 1330  1028 2063  2340 300
+    """
 )
 """Cameras that the fugitive does not know."""
 
@@ -92,7 +103,7 @@ def _coverage() -> Array:
 
 
 def _dense_patches(coverage: Array) -> Bools:
-    """Cells with more than 17 dense cells among the 36 from three before to two behind; none where these leave the map below."""
+    """Cells with more than 17 dense cells among the 36 from three before to two behind; none near the edges at 0."""
     dense = np.zeros((SIDE + 3, SIDE + 3), dtype=np.int64)
     dense[1 : SIDE + 1, 1 : SIDE + 1] = coverage < _DENSE_BELOW
     total = dense.cumsum(axis=0).cumsum(axis=1)
@@ -112,4 +123,5 @@ def _planning_grid(ground: Array) -> Array:
     padded[:SIDE, :SIDE] = ground
     blocks = padded.reshape(whole // _POOL, _POOL, whole // _POOL, _POOL).min(axis=(1, 3))
     rest = SIDE % _POOL
-    return blocks[:-rest, :-rest]
+    grid: Array = blocks[:-rest, :-rest]
+    return grid
