@@ -131,7 +131,7 @@ def score_forecasts(
     truth_m: Tensor,
     episode: Tensor,
     datum_m: Tensor,
-    obstacles: Sequence[Obstacles],
+    obstacles: Obstacles,
     paper_error_m: Tensor | None = None,
     seconds: float = 0.0,
 ) -> EpisodeScores:
@@ -141,8 +141,8 @@ def score_forecasts(
         found: the hypotheses, relative to the datum.
         truth_m: [B, 1, T, 2] relative to the datum.
         episode: [B] of each window.
-        datum_m: [B, 2] in the mission frame, where the obstacles are.
-        obstacles: of each window.
+        datum_m: [B, 2] in the mission frame.
+        obstacles: in the mission frame.
         paper_error_m: [B, H] for mixtures; the displacement error without.
         seconds: that sampling took.
     """
@@ -208,17 +208,10 @@ def _step_masses(length_m: Float64s, weight: Float64s, row: Int64s, num_rows: in
     return masses.reshape(num_rows, NUM_BINS)
 
 
-def _collisions(position: Tensor, weight: Tensor, datum_m: Tensor, obstacles: Sequence[Obstacles]) -> dict[str, Tensor]:
-    """Weighted shares [B] of states and segments in obstacles; windows with the same obstacles are tested together."""
-    states, segments = torch.zeros(len(position), dtype=torch.float64), torch.zeros(len(position), dtype=torch.float64)
-    which = np.array([id(item) for item in obstacles])
-    for chosen in np.unique(which):
-        rows = torch.from_numpy(np.flatnonzero(which == chosen))
-        here = obstacles[int(rows[0])]
-        if here.count == 0:
-            continue
-        track, offset = position[rows, :, 0], datum_m.double()[rows][:, None, None]
-        for target, test in ((states, states_in_collision), (segments, segments_in_collision)):
-            hit = test(track, here, offset_m=offset).double()
-            target[rows] = torch.einsum("bk,bkt->b", weight[rows], hit) / max(hit.shape[-1], 1)
-    return {"states_in_obstacles": states, "segments_in_obstacles": segments}
+def _collisions(position: Tensor, weight: Tensor, datum_m: Tensor, obstacles: Obstacles) -> dict[str, Tensor]:
+    """Weighted shares [B] of states and of segments in obstacles."""
+    shares = {}
+    for name, test in (("states_in_obstacles", states_in_collision), ("segments_in_obstacles", segments_in_collision)):
+        hit = test(position[:, :, 0], obstacles, offset_m=datum_m.double()[:, None, None]).double()
+        shares[name] = torch.einsum("bk,bkt->b", weight, hit) / max(hit.shape[-1], 1)
+    return shares

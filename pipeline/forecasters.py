@@ -1,7 +1,7 @@
 """Who forecasts: trained checkpoints by their preset, and rivals that need no training of their own, by name."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
@@ -9,12 +9,16 @@ import numpy as np
 
 from cadence.baselines.kalman import ConstantVelocityKalman, OrnsteinUhlenbeckKalman
 from cadence.baselines.library import TrajectoryLibrary
+from cadence.constraints.obstacles import Obstacles
 from cadence.diffusion.absolute import AbsoluteSampling
+from cadence.diffusion.scene import SceneSampling
 from cadence.errors import ConfigError
 from cadence.types import Context, Detections, Estimator
 from cadence.worlds.recordings import Recordings, cut_windows
 from pipeline.absolute import load_absolute
 from pipeline.checkpoints import find_checkpoint, read_info
+from pipeline.scene import load_scene
+from pipeline.train_rivals import load_rival
 from pipeline.training_run import OUTPUTS
 
 _NUM_FITTED = 64
@@ -22,6 +26,19 @@ _NUM_FITTED = 64
 
 
 class Forecaster(Protocol):
+    """An estimator that may want to know where its windows are, and what is in the way there."""
+
+    @property
+    def name(self) -> str:
+        """What it is called."""
+        ...
+
+    def placed(self, context: Context, obstacles: Obstacles | None = None) -> Estimator:
+        """The estimator for the windows of a context."""
+        ...
+
+
+class Placeable(Protocol):
     """An estimator that wants to know where its windows are."""
 
     @property
@@ -35,8 +52,24 @@ class Forecaster(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
+class Unguided:
+    """A forecaster that keeps out of nothing."""
+
+    estimator: Placeable
+
+    @property
+    def name(self) -> str:
+        """The estimator's."""
+        return self.estimator.name
+
+    def placed(self, context: Context, obstacles: Obstacles | None = None) -> Estimator:
+        """The estimator in its place."""
+        return self.estimator.placed(context)
+
+
+@dataclass(frozen=True, eq=False)
 class Anywhere:
-    """An estimator that does not need to know it: it sees relative positions only."""
+    """A forecaster that sees relative positions only."""
 
     estimator: Estimator
 
@@ -45,31 +78,42 @@ class Anywhere:
         """The estimator's."""
         return self.estimator.name
 
-    def placed(self, context: Context) -> Estimator:
+    def placed(self, context: Context, obstacles: Obstacles | None = None) -> Estimator:
         """The estimator itself."""
         return self.estimator
 
 
-def _paper(weights: Path, sampling: AbsoluteSampling) -> Forecaster:
-    return load_absolute(weights, sampling)
+@dataclass(frozen=True)
+class Samplings:
+    """How checkpoints are sampled, by preset."""
+
+    paper: AbsoluteSampling = field(default_factory=AbsoluteSampling)
+    scene: SceneSampling = field(default_factory=SceneSampling)
 
 
-def _mixture(weights: Path, sampling: AbsoluteSampling) -> Forecaster:
-    from pipeline.train_rivals import load_rival
-
-    return load_rival(weights, uses_goal=True)
+def _paper(weights: Path, samplings: Samplings) -> Forecaster:
+    return load_absolute(weights, samplings.paper)
 
 
-LOADERS: Mapping[str, Callable[[Path, AbsoluteSampling], Forecaster]] = {
+def _scene(weights: Path, samplings: Samplings) -> Forecaster:
+    return load_scene(weights, samplings.scene)
+
+
+def _mixture(weights: Path, samplings: Samplings) -> Forecaster:
+    return Unguided(load_rival(weights, uses_goal=True))
+
+
+LOADERS: Mapping[str, Callable[[Path, Samplings], Forecaster]] = {
+    "scene": _scene,
     "paper": _paper,
     "vrnn": _mixture,
     "grammi": _mixture,
     "grammi_without_mi": _mixture,
 }
-"""How a checkpoint of each preset becomes a forecaster; the sampling is of the preset "paper" alone."""
+"""How a checkpoint of each preset becomes a forecaster."""
 
 
-def load_forecaster(name: str, sampling: AbsoluteSampling) -> Forecaster:
+def load_forecaster(name: str, samplings: Samplings | None = None) -> Forecaster:
     """The forecaster of a .safetensors file or a shipped name; `ConfigError` where it is of a preset that does not forecast."""
     weights = find_checkpoint(name)
     preset = read_info(weights).preset
@@ -77,7 +121,7 @@ def load_forecaster(name: str, sampling: AbsoluteSampling) -> Forecaster:
         raise ConfigError(
             f"{weights}: a checkpoint of the preset {preset!r}, which does not forecast; give one of {', '.join(LOADERS)}"
         )
-    return LOADERS[preset](weights, sampling)
+    return LOADERS[preset](weights, samplings or Samplings())
 
 
 def label_of(name: str) -> str:
@@ -126,7 +170,7 @@ def _ou(data: RivalData) -> Forecaster:
 
 
 def _library(data: RivalData) -> Forecaster:
-    return TrajectoryLibrary.from_recordings(data.library())
+    return Unguided(TrajectoryLibrary.from_recordings(data.library()))
 
 
 FORECAST_RIVALS: Mapping[str, Callable[[RivalData], Forecaster]] = {"cv": _cv, "ou": _ou, "library": _library}

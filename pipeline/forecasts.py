@@ -19,15 +19,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from cadence.constraints.obstacles import Obstacles
 from cadence.diffusion.absolute import AbsoluteSampling
+from cadence.diffusion.scene import SceneSampling
 from cadence.errors import ConfigError, InputError
-from cadence.types import Estimator, HypothesisSet, WindowBatch
+from cadence.types import Context, Detections, Estimator, HypothesisSet, WindowBatch
 from cadence.worlds.recordings import ForecastWindows, Recordings, choose_windows, cut_windows
 from pipeline.checkpoints import checkpoint_hash, find_checkpoint
 from pipeline.config import config_as_dict
 from pipeline.forecast_scores import HORIZONS, EpisodeScores, score_forecasts
 from pipeline.forecast_tables import ForecastFacts, as_csv, as_json, as_markdown, headline, pool
-from pipeline.forecasters import FORECAST_RIVALS, Forecaster, RivalData, label_of, load_forecaster
+from pipeline.forecasters import FORECAST_RIVALS, Forecaster, RivalData, Samplings, label_of, load_forecaster
 from pipeline.manifest import StageResult, hash_file, run_stage, write_atomic
 from pipeline.progress import Progress
 from pipeline.provenance import versions
@@ -50,13 +52,14 @@ class ForecastConfig:
     known_start     the target's first position counts as a detection, as in the paper
     known_goal      a goal that the searching side knows of is told to estimators that read it
     trackers        so are the positions of the trackers
+    obstacles       and what is in the way, to estimators that keep out of it
     rivals          out of `pipeline.forecasters.FORECAST_RIVALS`, scored on the same windows
     checkpoints     further ones, scored beside: files or shipped names
     num_resamples   bootstrap resamples of an interval, over episodes
     seed            of the choice of windows, of the hypotheses and of the bootstrap
     recordings      how episodes are read from the logs; the folder of the call is its data
     training        episodes that rivals may learn from; without it none
-    paper           how checkpoints of the preset "paper" are sampled
+    paper, scene    how checkpoints of these presets are sampled
     """
 
     num_windows: int = 2000
@@ -64,6 +67,7 @@ class ForecastConfig:
     known_start: bool = True
     known_goal: bool = True
     trackers: bool = True
+    obstacles: bool = True
     rivals: tuple[str, ...] = ("cv",)
     checkpoints: tuple[str, ...] = ()
     num_resamples: int = 1000
@@ -71,6 +75,7 @@ class ForecastConfig:
     recordings: RecordingsConfig = field(default_factory=RecordingsConfig)
     training: RecordingsConfig | None = None
     paper: AbsoluteSampling = field(default_factory=AbsoluteSampling)
+    scene: SceneSampling = field(default_factory=SceneSampling)
 
     def __post_init__(self) -> None:
         unknown = [name for name in self.rivals if name not in FORECAST_RIVALS]
@@ -97,7 +102,8 @@ def evaluate_forecasts(
     Raises `InputError` where no log can be used, `ConfigError` for a checkpoint that is not there or does not forecast.
     """
     names = tuple(dict.fromkeys([checkpoint, *config.checkpoints]))
-    forecasters = {label_of(name): load_forecaster(name, config.paper) for name in names}
+    samplings = Samplings(config.paper, config.scene)
+    forecasters = {label_of(name): load_forecaster(name, samplings) for name in names}
     if len(forecasters) < len(names):
         raise ConfigError(f"evaluate.forecast.checkpoints: two of {', '.join(names)} have the same name; rename one")
     source = dataclasses.replace(config.recordings, data=folder)
@@ -111,10 +117,10 @@ def evaluate_forecasts(
         episodes = load_recordings(source, cache, progress)
         training = None if config.training is None else load_recordings(config.training, cache, progress).recordings
         windows = forecast_windows(episodes.recordings, config)
-        run = ForecastRun(episodes, windows, config.num_hypotheses, cache / "scores", progress)
+        run = ForecastRun(episodes, windows, config.num_hypotheses, cache / "scores", progress, config.obstacles)
         data = RivalData(episodes.recordings, training, config.known_start)
         scores = {
-            label: run.score(label, functools.partial(_same, forecasters[label]), [checkpoint_hash(path), config.paper])
+            label: run.score(label, functools.partial(_same, forecasters[label]), [checkpoint_hash(path), samplings])
             for label, path in zip(forecasters, weights, strict=True)
         }
         for name in config.rivals:
@@ -158,6 +164,7 @@ class ForecastRun:
     """Windows of some episodes, and where the scores of their blocks are kept.
 
     cache  a folder; None: nothing is kept
+    tells_obstacles  to forecasters that keep out of them
     """
 
     episodes: RecordingSet
@@ -165,6 +172,7 @@ class ForecastRun:
     num_hypotheses: int
     cache: Path | None
     progress: Progress
+    tells_obstacles: bool = True
 
     @functools.cached_property
     def content(self) -> str:
@@ -188,7 +196,8 @@ class ForecastRun:
         `identity` is what its answers depend on: names, hashes, configurations.
         """
         plain = [config_as_dict(item) if dataclasses.is_dataclass(item) else item for item in identity]
-        key = json.dumps([plain, self.content, self.num_hypotheses, versions(), SCORES_FORMAT], sort_keys=True, default=str)
+        asked = [self.num_hypotheses, self.tells_obstacles]
+        key = json.dumps([plain, self.content, asked, versions(), SCORES_FORMAT], sort_keys=True, default=str)
         stem = f"{label}-{hashlib.sha256(key.encode()).hexdigest()[:24]}"
         forecaster: Forecaster | None = None
         parts = []
@@ -207,8 +216,15 @@ class ForecastRun:
         return EpisodeScores.add(parts)
 
     def _score_block(self, forecaster: Forecaster, part: ForecastWindows) -> EpisodeScores:
+        """The windows of episodes with the same obstacles go together."""
+        which = [id(self.episodes.obstacles[index]) for index in part.episode.tolist()]
+        groups = [part[torch.tensor([item == chosen for item in which])] for chosen in dict.fromkeys(which)]
+        return EpisodeScores.add([self._score_group(forecaster, group) for group in groups])
+
+    def _score_group(self, forecaster: Forecaster, part: ForecastWindows) -> EpisodeScores:
+        obstacles = self.episodes.obstacles[int(part.episode[0])]
         begin = time.process_time()
-        estimator = forecaster.placed(part.context)
+        estimator = forecaster.placed(part.context, obstacles if self.tells_obstacles else None)
         found = estimator.sample(part.windows, self.num_hypotheses)
         seconds = time.process_time() - begin
         num_lost = int((~torch.isfinite(found.position_m)).flatten(1).any(dim=1).sum())
@@ -217,7 +233,6 @@ class ForecastRun:
                 f"{forecaster.name}: no position for {num_lost} of {len(part)} windows; does it need a known goal "
                 "or trackers that the logs do not have? See evaluate.forecast"
             )
-        obstacles = [self.episodes.obstacles[index] for index in part.episode.tolist()]
         paper = paper_error(estimator, part.windows, part.truth_m)
         return score_forecasts(found, part.truth_m, part.episode, part.context.datum_m, obstacles, paper, seconds)
 
@@ -243,11 +258,28 @@ def _kept(path: Path | None) -> EpisodeScores | None:
 
 def truth_scores(episodes: RecordingSet, windows: ForecastWindows) -> EpisodeScores:
     """The truth scored as if it were a forecast of one hypothesis: how long its steps are, and how often it is in obstacles."""
-    status = tuple(("ok",) for _ in range(len(windows)))
-    weight = torch.ones(len(windows), 1, dtype=torch.float64)
-    obstacles = [episodes.obstacles[index] for index in windows.episode.tolist()]
-    found = HypothesisSet(windows.truth_m[:, None], weight, status)
-    return score_forecasts(found, windows.truth_m, windows.episode, windows.context.datum_m, obstacles)
+    return ForecastRun(episodes, windows, 1, None, Progress(quiet=True)).score("truth", lambda: _Truth(windows), [])
+
+
+@dataclass(frozen=True, eq=False)
+class _Truth:
+    """Answers with what came, for windows that it finds by their seeds."""
+
+    windows: ForecastWindows
+    name: str = "truth"
+
+    def placed(self, context: Context, obstacles: Obstacles | None = None) -> Estimator:
+        return self
+
+    def fit(self, tracks: Detections) -> "_Truth":
+        return self
+
+    def sample(self, windows: WindowBatch, num_hypotheses: int) -> HypothesisSet:
+        seeds, order = self.windows.windows.seeds.sort()
+        track = self.windows.truth_m[order[torch.searchsorted(seeds, windows.seeds)]]
+        weight = torch.full((len(track), num_hypotheses), 1.0 / num_hypotheses, dtype=torch.float64)
+        position = track[:, None].expand(-1, num_hypotheses, -1, -1, -1)
+        return HypothesisSet(position, weight, tuple(("ok",) for _ in range(len(track))))
 
 
 def facts_of(episodes: RecordingSet, windows: ForecastWindows, config: ForecastConfig) -> ForecastFacts:

@@ -39,7 +39,7 @@ def hypotheses(position: torch.Tensor, weight: torch.Tensor | None = None) -> Hy
 def scored(position: torch.Tensor, truth: torch.Tensor, episode: list[int] | None = None, **more) -> EpisodeScores:
     episodes = torch.tensor(episode or [0] * len(truth))
     datum = more.pop("datum", torch.zeros(len(truth), 2, dtype=torch.float64))
-    obstacles = more.pop("obstacles", [NONE] * len(truth))
+    obstacles = more.pop("obstacles", NONE)
     return score_forecasts(hypotheses(position, more.pop("weight", None)), truth, episodes, datum, obstacles, **more)
 
 
@@ -108,15 +108,13 @@ def test_shares_in_obstacles_are_of_states_and_of_the_ways_between() -> None:
     track[..., 0] = 10.0 * torch.arange(120)
     wall = Obstacles(torch.tensor([[1000.0 + 305.0, 0.0, 3.0]], dtype=torch.float64))  # between two states, on none
     datum = torch.tensor([[1000.0, 0.0]], dtype=torch.float64)
-    found = scored(track, track[:, 0], datum=datum, obstacles=[wall])
+    found = scored(track, track[:, 0], datum=datum, obstacles=wall)
     assert found.share("states_in_obstacles").tolist() == [0.0]
     assert found.share("segments_in_obstacles").tolist() == [pytest.approx(1 / 119)]
     disc = Obstacles(torch.tensor([[1000.0 + 300.0, 0.0, 10.5]], dtype=torch.float64))
-    both = scored(
-        torch.cat([track, track]), torch.cat([track, track])[:, 0], [0, 1], datum=datum.expand(2, 2), obstacles=[disc, wall]
-    )
-    assert both.share("states_in_obstacles").tolist() == [pytest.approx(3 / 120), 0.0]
-    assert both.share("segments_in_obstacles").tolist() == [pytest.approx(4 / 119), pytest.approx(1 / 119)]
+    hit = scored(track, track[:, 0], datum=datum, obstacles=disc)
+    assert hit.share("states_in_obstacles").tolist() == [pytest.approx(3 / 120)]
+    assert hit.share("segments_in_obstacles").tolist() == [pytest.approx(4 / 119)]
 
 
 def test_quantiles_of_step_lengths_are_right_to_one_per_cent() -> None:

@@ -1,5 +1,6 @@
 """Evaluation of forecasts on folders of logs: the protocol, resuming, what is refused."""
 
+import dataclasses
 import json
 import shutil
 from pathlib import Path
@@ -10,6 +11,7 @@ import torch
 from small_logs import Row, detection, pose, write_log
 
 import cli
+from cadence.constraints.obstacles import Obstacles
 from cadence.diffusion.absolute import AbsoluteConfig, AbsoluteSampling
 from cadence.errors import ConfigError, UsageError
 from cadence.network.trajectory import TrajectoryNetwork, TrajectoryNetworkConfig
@@ -119,6 +121,30 @@ def test_known_answers_through_the_whole_protocol(tmp_path: Path, known_start: b
     assert truth.mean("ade").tolist() == [0.0] * 5
     if not known_start:
         assert windows.windows.is_active.all()
+
+
+def test_obstacles_are_told_and_differ_by_episode(tmp_path: Path) -> None:
+    run = run_on(long_folder(tmp_path), None)
+    walls = [Obstacles(torch.tensor([[5000.0, 0.0, radius]], dtype=torch.float64)) for radius in (1.0, 2.0)]
+    episodes = dataclasses.replace(run.episodes, obstacles=tuple(walls[index % 2] for index in range(4)))
+    told: list[tuple[object, set[int]]] = []
+
+    class Careful(Straight):
+        def placed(self, context: Context, obstacles: Obstacles | None = None) -> "Careful":
+            self.wall = obstacles
+            return self
+
+        def sample(self, windows: WindowBatch, num_hypotheses: int) -> HypothesisSet:
+            told.append((self.wall, set((windows.seeds // 10_007).tolist())))
+            return super().sample(windows, num_hypotheses)
+
+    both = dataclasses.replace(run, episodes=episodes)
+    found = both.score("careful", Careful, [])
+    assert {(wall, episode % 2) for wall, numbers in told for episode in numbers} == {(walls[0], 0), (walls[1], 1)}
+    assert np.array_equal(found.sums, run.score("careful", Careful, []).sums)
+    told.clear()
+    dataclasses.replace(both, tells_obstacles=False).score("careful", Careful, [])
+    assert {wall for wall, _ in told} == {None}
 
 
 def test_a_killed_evaluation_goes_on_where_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
