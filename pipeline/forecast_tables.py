@@ -159,14 +159,16 @@ def mean_interval(sums: Float64s, scores: EpisodeScores, seed: int, num_resample
 
 
 def comparison(
-    own: str, rival: str, step: int | None, scores: Mapping[str, EpisodeScores], seed: int, num_resamples: int
-) -> Comparison:
-    """Paired: both are resampled together."""
+    own: str, rival: str, step: int | None, scores: Mapping[str, EpisodeScores], seed: int, num_resamples: int,
+    measure: str = "energy_score", rival_measure: str | None = None,
+) -> Comparison:  # fmt: skip
+    """Of a measure, the energy score unless said otherwise, with the same or another one of the rival; resampled together."""
     mine, theirs = scores[own], scores[rival]
     if not np.array_equal(mine.episode, theirs.episode) or not np.array_equal(mine.count, theirs.count):
         raise ValueError(f"{own} and {rival} were not scored on the same windows")
     index = list(range(len(HORIZONS))) if step is None else [HORIZONS.index(step)]
-    top, bottom = (part.measure("energy_score")[:, index].mean(axis=1) for part in (mine, theirs))
+    top = mine.measure(measure)[:, index].mean(axis=1)
+    bottom = theirs.measure(rival_measure or measure)[:, index].mean(axis=1)
     difference = mean_interval(top - bottom, mine, seed, num_resamples)
     rng = np.random.default_rng([seed, 21])
     ratio = bootstrap_ratio(top, bottom, np.arange(len(top)), rng, num_resamples)
