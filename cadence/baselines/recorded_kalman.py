@@ -66,10 +66,23 @@ class RecordedKalman:
         return self
 
     def sample(self, windows: WindowBatch, num_hypotheses: int) -> HypothesisSet:
-        """Joint samples of past and future; deterministic in the windows' seeds."""
-        thinned = thin(windows.detections, self.spacing * windows.step_s, self.num_detections)
-        batch = WindowBatch(windows.time_s, self._with_waver(thinned), windows.seeds, windows.origin_index)
-        return self.kalman.sample(batch, num_hypotheses)
+        """Joint samples of past and future; deterministic in the windows' seeds.
+
+        Windows with equally many detections are drawn together: padding would move the samples by the smoother's jitter.
+        """
+        thinned = self._with_waver(thin(windows.detections, self.spacing * windows.step_s, self.num_detections))
+        batch = WindowBatch(windows.time_s, thinned, windows.seeds, windows.origin_index)
+        longest = thinned.count.amax(dim=1)
+        order = longest.argsort(stable=True)
+        groups = torch.split(order, longest.bincount().tolist()) if len(order) else (order,)
+        parts = [self.kalman.sample(batch[group], num_hypotheses) for group in groups if len(group) or not len(order)]
+        back = order.argsort()
+        status = [words for part in parts for words in part.status]
+        return HypothesisSet(
+            torch.cat([part.position_m for part in parts])[back],
+            torch.cat([part.weight for part in parts])[back],
+            tuple(status[place] for place in back.tolist()),
+        )
 
     def _with_waver(self, detections: Detections) -> Detections:
         wider = detections.covariance_m2 + self.waver_m**2 * torch.eye(2, dtype=detections.covariance_m2.dtype)
