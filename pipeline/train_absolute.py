@@ -1,11 +1,14 @@
-"""Training of the paper's preset: windows in absolute coordinates from logs with truth, or from the simulator on the fly."""
+"""Training of the paper's preset: windows in absolute coordinates from episodes of one target, logs or the simulator."""
 
+import dataclasses
 import functools
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
@@ -13,12 +16,14 @@ from cadence.bank.rows import active_rows
 from cadence.diffusion.absolute import AbsoluteConfig, detection_rows
 from cadence.errors import ConfigError, InputError
 from cadence.network.trajectory import TrajectoryNetwork, TrajectoryNetworkConfig
-from cadence.training.absolute import AbsoluteWindows, absolute_loss, join_absolute
+from cadence.training.absolute import AbsoluteWindows, absolute_loss, forecast_rows, join_absolute
 from cadence.training.loop import Loss, Trainer
 from cadence.worlds.patrol import PatrolConfig, simulate_patrol
+from cadence.worlds.recordings import NUM_STEPS, Int64s, Recordings, cut_windows
 from pipeline.extract import ExtractConfig
 from pipeline.manifest import StageResult
 from pipeline.progress import Progress
+from pipeline.training_episodes import EpisodeSource, load_pool
 from pipeline.training_run import TrainingRun, run_training
 from pipeline.training_tables import TrainingMission, mission_of_episode, missions_of_logs
 from pipeline.windows import Float64s, Grid, MissionWindows, build_windows, truth_on_grid
@@ -56,6 +61,12 @@ class AbsoluteTraining:
     num_episodes, num_validation_episodes  of the simulator
     patrol         the simulator's settings
     extract        where truth and detections are in the logs
+    sources        episodes of one target to train on, in place of logs and patrol: any number of windows, as in the paper
+                   with the first position as a detection and the target parked after the end
+    validation     episodes to validate on; without them the last ones of each source (validation_share)
+    num_validation_windows  of each source
+    hidden_goals   share of the windows of `sources` whose known goal is hidden, for networks with known_goal; more than 0
+                   makes a checkpoint that serves with and without
     """
 
     network: TrajectoryNetworkConfig = field(default_factory=TrajectoryNetworkConfig)
@@ -74,15 +85,25 @@ class AbsoluteTraining:
     num_validation_episodes: int = 16
     patrol: PatrolConfig = field(default_factory=_patrol)
     extract: ExtractConfig = field(default_factory=ExtractConfig)
+    sources: tuple[EpisodeSource, ...] = ()
+    validation: tuple[EpisodeSource, ...] = ()
+    num_validation_windows: int = 1000
+    hidden_goals: float = 0.0
 
     def __post_init__(self) -> None:
         self.model_config((0.0, 0.0), self.scale_m or 1.0)  # refuses what cannot be
-        if min(self.num_windows, self.num_episodes, self.num_validation_episodes) < 1:
-            raise ValueError("num_windows, num_episodes and num_validation_episodes must be at least 1")
+        if min(self.num_windows, self.num_episodes, self.num_validation_episodes, self.num_validation_windows) < 1:
+            raise ValueError("num_windows, num_episodes, num_validation_episodes and num_validation_windows must be at least 1")
         if not 0 < self.validation_share < 1 or not self.max_gap_steps > 0 or self.context_steps < self.history_steps:
             raise ValueError("validation_share must lie in 0 ... 1, max_gap_steps be positive, context_steps reach the history")
-        if self.network.known_goal:
-            raise ValueError("network.known_goal: logs do not say where the goal is; train without it")
+        if self.network.known_goal and not self.sources:
+            raise ValueError("network.known_goal: only episodes of `sources` say where the goal is; train without it")
+        if self.validation and not self.sources:
+            raise ValueError("validation goes with sources; logs and patrol keep some of their own episodes for it")
+        if self.sources and (self.network.num_steps, self.history_steps) != (NUM_STEPS, 1):
+            raise ValueError(f"windows of sources have {NUM_STEPS} steps from now on: network.num_steps, history_steps = 1")
+        if not 0 <= self.hidden_goals <= 1:
+            raise ValueError("hidden_goals must lie in 0 ... 1")
         if self.network.elapsed and self.relative:
             raise ValueError("network.elapsed needs the time since the mission's start, which a relative model does not have")
 
@@ -97,12 +118,16 @@ class AbsoluteTraining:
             self.relative,
             self.clip,
             float(self.context_steps),
+            self.network.known_goal and self.hidden_goals > 0,
         )
 
 
 def train_absolute(out: Path, config: "TrainConfig", progress: Progress, force: bool = False) -> StageResult:
-    """Train the paper's preset into `out`; see `pipeline.train.train`. `config.data` None means the simulator."""
-    source = _LogSource(out, config, progress) if config.data is not None else _PatrolSource(config)
+    """Train the paper's preset into `out`; see `pipeline.train.train`.
+
+    From `config.paper.sources`, or else from the logs in `config.data`, or without these from the simulator.
+    """
+    source = _source(out, config, progress)
     with torch.random.fork_rng(devices=[]):  # layers take their first weights from the global stream, which is left as it was
         torch.random.manual_seed(config.seed)
         trainer = Trainer(TrajectoryNetwork(config.paper.network), config.optimiser)
@@ -128,6 +153,60 @@ def train_absolute(out: Path, config: "TrainConfig", progress: Progress, force: 
     return run_training(run, trainer, loss_at, validate, progress, force)
 
 
+class _Source(Protocol):
+    """Where batches come from."""
+
+    model: AbsoluteConfig
+    validation: AbsoluteWindows
+
+    def batch(self, step: int, size: int, generator: torch.Generator) -> AbsoluteWindows:
+        """The windows of a step, which depend on nothing but it and the generator."""
+        ...
+
+
+def _source(out: Path, config: "TrainConfig", progress: Progress) -> _Source:
+    if config.paper.sources:
+        if config.data is not None:
+            raise ConfigError("train.data and train.paper.sources: both say what to train on; give one of them")
+        return _EpisodeSource(out / "episodes", config, progress)
+    return _LogSource(out, config, progress) if config.data is not None else _PatrolSource(config)
+
+
+class _EpisodeSource:
+    """Windows cut out of episodes of one target when they are needed, every step of every episode equally likely."""
+
+    def __init__(self, cache: Path, config: "TrainConfig", progress: Progress) -> None:
+        paper = config.paper
+        load = functools.partial(load_pool, cache=cache, step_s=paper.step_s, where="train.paper", progress=progress)
+        self.pool, self.paper, self.seed = load(paper.sources), paper, config.seed
+        if paper.validation:
+            held_out = load(paper.validation)
+        else:
+            self.pool, held_out = self.pool.split(paper.validation_share)
+        self.model = paper.model_config(*_map_limits(paper, [part.position_m.T for part in self.pool.parts]))
+        drawn = held_out.rows_of_each(paper.num_validation_windows, np.random.default_rng([config.seed, 1, 2]))
+        windows = join_absolute([self._cut(part, rows) for part, rows in drawn])
+        self.validation = self._hidden(windows, torch.Generator().manual_seed(config.seed))
+
+    def batch(self, step: int, size: int, generator: torch.Generator) -> AbsoluteWindows:
+        rng = np.random.default_rng([self.seed, step])
+        return self._hidden(join_absolute([self._cut(part, rows) for part, rows in self.pool.rows(size, rng)]), generator)
+
+    def _cut(self, part: Recordings, rows: Int64s) -> AbsoluteWindows:
+        episode = np.searchsorted(part.offset, rows, side="right") - 1
+        keep = self.model.network.max_detections
+        cut = cut_windows(part, episode, rows - part.offset[episode], num_detections=keep, num_tracker_steps=1)
+        return forecast_rows(cut, self.model)
+
+    def _hidden(self, windows: AbsoluteWindows, generator: torch.Generator) -> AbsoluteWindows:
+        """Some of the windows are not told the goal."""
+        if not self.model.optional_goal or windows.extra is None:
+            return windows
+        is_hidden = torch.rand(len(windows), 1, generator=generator) < self.paper.hidden_goals
+        extra = torch.cat([windows.extra[:, :2].masked_fill(is_hidden, 0.0), windows.extra[:, 2:]], dim=1)
+        return dataclasses.replace(windows, extra=extra)
+
+
 class _LogSource:
     """Windows of a folder of logs; some of the logs, whole, are for validation."""
 
@@ -141,7 +220,8 @@ class _LogSource:
         num_validation = min(max(1, round(paper.validation_share * len(missions))), len(missions) - 1)
         kept = [missions[index] for index in sorted(order[num_validation:])]
         held_out = [missions[index] for index in sorted(order[:num_validation])]
-        self.model = paper.model_config(*_map_limits(paper, kept))
+        places = [np.stack([mission.truth[name].to_numpy() for name in ("x_m", "y_m")]) for mission in kept]
+        self.model = paper.model_config(*_map_limits(paper, places))
         make = functools.partial(mission_windows, training=paper, model=self.model)
         self.windows = _joined([make(mission, seed=config.seed + i) for i, mission in enumerate(kept)], config.data)
         offset = config.seed + _VALIDATION_SEED_OFFSET
@@ -270,10 +350,10 @@ def _filled(truth_m: Tensor, is_known: Tensor) -> Tensor:
     return truth_m.gather(-2, index[..., None].expand(truth_m.shape))
 
 
-def _map_limits(training: AbsoluteTraining, missions: list[TrainingMission]) -> tuple[tuple[float, float], float]:
-    """Centre and half side of the square that holds all truth, with a little room; what is configured is kept."""
-    columns = [np.concatenate([mission.truth[name].to_numpy() for mission in missions]) for name in ("x_m", "y_m")]
-    low, high = (np.array([bound(column) for column in columns]) for bound in (np.min, np.max))
+def _map_limits(training: AbsoluteTraining, places_m: Sequence[npt.NDArray[Any]]) -> tuple[tuple[float, float], float]:
+    """Centre and half side of the square that holds all places [2, N], with a little room; what is configured is kept."""
+    low = np.min([place.min(axis=1) for place in places_m], axis=0).astype(np.float64)
+    high = np.max([place.max(axis=1) for place in places_m], axis=0).astype(np.float64)
     middle = 0.5 * (low + high)
     centre = training.centre_m or (float(middle[0]), float(middle[1]))
     half = float(np.maximum(high - np.array(centre), np.array(centre) - low).max()) * _MARGIN

@@ -10,15 +10,14 @@ import torch
 from torch import nn
 
 from cadence.diffusion.scene_frame import SceneConfig
-from cadence.errors import ConfigError
 from cadence.network.scene import Pieces, SceneInputs, SceneNetwork
 from cadence.training.loop import Loss, Trainer
 from cadence.training.scene import Dropout, SceneWindows, diffusion_loss, energy_loss, scene_windows
-from cadence.worlds.recordings import Recordings
 from pipeline.checkpoints import find_checkpoint, load_weights
 from pipeline.manifest import StageResult
 from pipeline.progress import Progress
-from pipeline.recordings import RecordingsConfig, load_recordings
+from pipeline.recordings import RecordingsConfig
+from pipeline.training_episodes import EpisodePool, EpisodeSource, load_pool
 from pipeline.training_run import TrainingRun, run_training
 
 if TYPE_CHECKING:
@@ -27,24 +26,12 @@ if TYPE_CHECKING:
 _VALIDATION_BATCH = 250
 
 
-@dataclass(frozen=True)
-class SceneSource:
-    """Episodes to learn from.
-
-    share     of the windows of a batch, relative to the other sources
-    episodes  where they come from
-    """
-
-    share: float = 1.0
-    episodes: RecordingsConfig = field(default_factory=RecordingsConfig)
+def _worlds() -> tuple[EpisodeSource, ...]:
+    return tuple(EpisodeSource(1.0, RecordingsConfig(set=name, num_episodes=4000)) for name in ("low", "med", "high"))
 
 
-def _worlds() -> tuple[SceneSource, ...]:
-    return tuple(SceneSource(1.0, RecordingsConfig(set=name, num_episodes=4000)) for name in ("low", "med", "high"))
-
-
-def _validation() -> tuple[SceneSource, ...]:
-    return tuple(SceneSource(1.0, RecordingsConfig(set=name, num_episodes=50, seed=1)) for name in ("low", "med", "high"))
+def _validation() -> tuple[EpisodeSource, ...]:
+    return tuple(EpisodeSource(1.0, RecordingsConfig(set=name, num_episodes=50, seed=1)) for name in ("low", "med", "high"))
 
 
 @dataclass(frozen=True)
@@ -67,8 +54,8 @@ class SceneTraining:
     model: SceneConfig = field(default_factory=SceneConfig)
     objective: Literal["diffusion", "energy"] = "diffusion"
     start: str | None = None
-    sources: tuple[SceneSource, ...] = field(default_factory=_worlds)
-    validation: tuple[SceneSource, ...] = field(default_factory=_validation)
+    sources: tuple[EpisodeSource, ...] = field(default_factory=_worlds)
+    validation: tuple[EpisodeSource, ...] = field(default_factory=_validation)
     num_validation_windows: int = 1000
     told: Dropout = field(default_factory=Dropout)
     path_weight: float = 1.0
@@ -77,8 +64,8 @@ class SceneTraining:
     score_weights: tuple[float, float] = (0.3, 0.3)
 
     def __post_init__(self) -> None:
-        if not self.sources or not self.validation or any(source.share <= 0 for source in self.sources + self.validation):
-            raise ValueError("sources and validation must name episodes, with positive shares")
+        if not self.sources or not self.validation:
+            raise ValueError("sources and validation must name episodes")
         if self.few_steps < 1 or self.num_samples < 2 or self.num_validation_windows < 1:
             raise ValueError("few_steps and num_validation_windows must be at least 1, num_samples at least 2")
         if self.objective == "energy" and self.start is None:
@@ -87,29 +74,41 @@ class SceneTraining:
 
 def train_scene(out: Path, config: "TrainConfig", progress: Progress, force: bool = False) -> StageResult:
     """Train the scene preset into `out`; see `pipeline.train.train`."""
-    scene = config.scene
-    parts = [load_recordings(source.episodes, out / "episodes", progress).recordings for source in scene.sources]
-    held_out = [load_recordings(source.episodes, out / "episodes", progress).recordings for source in scene.validation]
+    scene, cache = config.scene, out / "episodes"
     model = _model_config(scene)
-    if any(part.step_s != model.step_s for part in [*parts, *held_out]):
-        raise ConfigError(f"train.scene.model.step_s is {model.step_s:g} s; the episodes have another step")
+    pool = load_pool(scene.sources, cache, model.step_s, "train.scene.model", progress)
+    held_out = load_pool(scene.validation, cache, model.step_s, "train.scene.model", progress)
     with torch.random.fork_rng(devices=[]):  # layers take their first weights from the global stream, which is left as it was
         torch.random.manual_seed(config.seed)
         network = model.build()
     if scene.start is not None:
         load_weights(find_checkpoint(scene.start), network)
-    trainer = Trainer(network, config.optimiser)
-    shares = np.array([source.share for source in scene.sources])
+    return train_scene_network(out, config, network, pool, held_out, progress, force)
+
+
+def train_scene_network(
+    out: Path,
+    config: "TrainConfig",
+    network: SceneNetwork,
+    pool: EpisodePool,
+    held_out: EpisodePool,
+    progress: Progress,
+    force: bool = False,
+) -> StageResult:
+    """Train a network that begins as it is given, on the windows of `pool`; those of `held_out` validate it."""
+    scene = config.scene
+    model = _model_config(scene)
 
     def loss_at(step: int) -> Loss:
         rng = np.random.default_rng([config.seed, step])
-        counts = rng.multinomial(config.batch_size, shares / shares.sum())
-        windows = _joined([_draw(part, int(num), scene, model, rng) for part, num in zip(parts, counts, strict=True) if num])
+        drawn = pool.rows(config.batch_size, rng)
+        windows = _joined([scene_windows(part, rows, model, scene.told, rng) for part, rows in drawn])
         generator = torch.Generator().manual_seed(config.seed * 7_919 + step)
         return lambda network: _loss(network, windows, scene, model, generator)
 
     rng = np.random.default_rng([config.seed, 1, 2])
-    validation = _joined([_draw(part, scene.num_validation_windows, scene, model, rng) for part in held_out])
+    checks = held_out.rows_of_each(scene.num_validation_windows, rng)
+    validation = _joined([scene_windows(part, rows, model, scene.told, rng) for part, rows in checks])
 
     @torch.no_grad()
     def validate(network: nn.Module) -> float:
@@ -120,7 +119,7 @@ def train_scene(out: Path, config: "TrainConfig", progress: Progress, force: boo
 
     steps = config.optimiser.num_steps
     run = TrainingRun(out, "scene", config, model, steps, config.validate_every, config.save_every)
-    return run_training(run, trainer, loss_at, validate, progress, force)
+    return run_training(run, Trainer(network, config.optimiser), loss_at, validate, progress, force)
 
 
 def _model_config(scene: SceneTraining) -> SceneConfig:
@@ -134,12 +133,6 @@ def _loss(
     if scene.objective == "diffusion":
         return diffusion_loss(network, windows, model, scene.path_weight, generator)
     return energy_loss(network, windows, model, scene.num_samples, scene.score_weights, generator)
-
-
-def _draw(part: Recordings, num: int, scene: SceneTraining, model: SceneConfig, rng: np.random.Generator) -> SceneWindows:
-    """Windows at random steps, all equally likely."""
-    rows = rng.integers(0, len(part.position_m), num)
-    return scene_windows(part, rows, model, scene.told, rng)
 
 
 def _joined(parts: list[SceneWindows]) -> SceneWindows:

@@ -45,6 +45,7 @@ class AbsoluteConfig:
     relative       positions about the last detection instead of the centre
     clip           clean estimates are clamped to [-clip, clip]
     age_scale_steps  ages of detections are counted in this many steps (the paper's longest mission)
+    optional_goal  the network was trained with and without the known goal: an unknown one is told as zeros
     """
 
     network: TrajectoryNetworkConfig = field(default_factory=TrajectoryNetworkConfig)
@@ -55,6 +56,7 @@ class AbsoluteConfig:
     relative: bool = False
     clip: float = 1.0
     age_scale_steps: float = 4320.0
+    optional_goal: bool = False
 
     def __post_init__(self) -> None:
         if not (self.step_s > 0 and self.scale_m > 0 and self.clip > 0 and self.age_scale_steps > 0):
@@ -144,7 +146,8 @@ class AbsoluteModel:
         parts = [torch.zeros(0, num_hypotheses, windows.num_steps, 2, dtype=torch.float64)]
         for begin in range(0, len(seeds), per_chunk):
             pick = slice(begin, begin + per_chunk)
-            frame = self._frame(nodes[torch.arange(len(seeds))[pick]], window[pick], agent[pick])
+            rows = nodes[torch.arange(len(seeds))[pick]]
+            frame = absolute_frame(rows, window[pick], agent[pick], self.context, self.config)
             parts.append(self._sample_rows(frame, RowNoise(seeds[pick]), num_hypotheses))
         return scatter_hypotheses(torch.cat(parts), windows)
 
@@ -161,34 +164,7 @@ class AbsoluteModel:
         if self.context is None and not (self.config.relative and self.sampling.guidance == "none"):
             raise ValueError("AbsoluteModel: the windows have no place in the mission frame; use placed()")
 
-    def _frame(self, nodes: Nodes, window: Tensor, agent: Tensor) -> "_Frame":
-        rows = torch.arange(len(window))
-        datum = torch.zeros(len(window), 2, dtype=torch.float64)
-        if self.context is not None:
-            datum = self.context.datum_m.double()[window]
-        centre = torch.tensor(self.config.centre_m, dtype=torch.float64) - datum
-        if self.config.relative:
-            centre = nodes.position_m[rows, nodes.is_observed.sum(dim=1) - 1]
-        extra = self._extra(window, agent, datum + centre)
-        return _Frame(nodes, centre, datum, extra)
-
-    def _extra(self, window: Tensor, agent: Tensor, centre_m: Tensor) -> Tensor | None:
-        """Further inputs [R, 1, E], as far as the network has them."""
-        network, context = self.config.network, self.context
-        columns = []
-        if network.known_goal:
-            if context is None or context.known_goal_m is None:
-                raise ConfigError(
-                    "this checkpoint wants to know the goal, and none is given; use one trained without known_goal"
-                )
-            columns.append((context.known_goal_m.double()[window, agent] - centre_m) / self.config.scale_m)
-        if network.elapsed:
-            if context is None or context.elapsed_s is None:
-                raise ConfigError("this checkpoint wants the elapsed share, and none is given; use one trained without elapsed")
-            columns.append(context.elapsed_s.double()[window, None] / (self.config.step_s * self.config.age_scale_steps))
-        return torch.cat(columns, dim=-1)[:, None].float() if columns else None
-
-    def _sample_rows(self, frame: "_Frame", stream: "RowNoise", num_hypotheses: int) -> Tensor:
+    def _sample_rows(self, frame: "AbsoluteFrame", stream: "RowNoise", num_hypotheses: int) -> Tensor:
         """Hypotheses [R, K, T, 2] in metres relative to the datum."""
         detections = self._detections(frame)
         start = stream.draw((num_hypotheses, self.config.network.num_steps, 2))
@@ -208,7 +184,7 @@ class AbsoluteModel:
             state = solve(denoise, start, angles, on_state=on_state)
         return state.double() * self.config.scale_m + frame.centre_m[:, None, None]
 
-    def _detections(self, frame: "_Frame") -> GridDetections:
+    def _detections(self, frame: "AbsoluteFrame") -> GridDetections:
         """What lies on the grid, in normalised units."""
         nodes, scale = frame.nodes, self.config.scale_m
         floor = self.sampling.floor**2 * torch.eye(2, dtype=torch.float64)
@@ -227,7 +203,7 @@ class AbsoluteModel:
         # the start's own noise, at every level: a path of noise levels that one clean trajectory has
         return lambda state, angle: overwritten_at_level(state, cells, angle, start)
 
-    def _paper_guidance(self, frame: "_Frame") -> Hook:
+    def _paper_guidance(self, frame: "AbsoluteFrame") -> Hook:
         """Algorithm 1 on the normalised mean; the cost is in metres, its step length in map units."""
         cost = PaperCost(self.obstacles, unit_m=self.config.scale_m, offset_m=frame.datum_m[:, None, None])
 
@@ -238,12 +214,12 @@ class AbsoluteModel:
 
         return guided
 
-    def _metres(self, normalised: Tensor, frame: "_Frame") -> Tensor:
+    def _metres(self, normalised: Tensor, frame: "AbsoluteFrame") -> Tensor:
         return normalised * self.config.scale_m + frame.centre_m[:, None, None].to(normalised)
 
 
 @dataclass(frozen=True, eq=False)
-class _Frame:
+class AbsoluteFrame:
     """R rows: their detections, the normaliser's centre and the datum [R, 2], further inputs [R, 1, E]."""
 
     nodes: Nodes
@@ -251,27 +227,63 @@ class _Frame:
     datum_m: Tensor
     extra: Tensor | None
 
+    def detection_rows(self, config: AbsoluteConfig) -> tuple[Tensor, Tensor]:
+        """What the network reads of the detections: rows [R, N, 3] and which of them exist [R, N]."""
+        position = (self.nodes.position_m - self.centre_m[:, None]) / config.scale_m
+        age = -self.nodes.time_s / config.step_s / config.age_scale_steps
+        return detection_rows(age, position, self.nodes.is_observed, config.network.max_detections)
+
+
+def absolute_frame(
+    nodes: Nodes, window: Tensor, agent: Tensor, context: Context | None, config: AbsoluteConfig
+) -> AbsoluteFrame:
+    """The rows `nodes` of the given windows and agents [R], in their place as far as a context is given."""
+    rows = torch.arange(len(window))
+    datum = torch.zeros(len(window), 2, dtype=torch.float64)
+    if context is not None:
+        datum = context.datum_m.double()[window]
+    centre = torch.tensor(config.centre_m, dtype=torch.float64) - datum
+    if config.relative:
+        centre = nodes.position_m[rows, nodes.is_observed.sum(dim=1) - 1]
+    return AbsoluteFrame(nodes, centre, datum, _extra(window, agent, datum + centre, context, config))
+
+
+def _extra(window: Tensor, agent: Tensor, centre_m: Tensor, context: Context | None, config: AbsoluteConfig) -> Tensor | None:
+    """Further inputs [R, 1, E], as far as the network has them."""
+    columns = []
+    if config.network.known_goal:
+        goal_m = None if context is None or context.known_goal_m is None else context.known_goal_m.double()[window, agent]
+        if goal_m is None or not (config.optional_goal or bool(goal_m.isfinite().all())):
+            raise ConfigError("this checkpoint wants to know the goal, and none is given; use one trained without known_goal")
+        columns.append(((goal_m - centre_m) / config.scale_m).nan_to_num(nan=0.0))
+    if config.network.elapsed:
+        if context is None or context.elapsed_s is None:
+            raise ConfigError("this checkpoint wants the elapsed share, and none is given; use one trained without elapsed")
+        columns.append(context.elapsed_s.double()[window, None] / (config.step_s * config.age_scale_steps))
+    return torch.cat(columns, dim=-1)[:, None].float() if columns else None
+
 
 class _Denoiser:
     """(noisy [R, K, T, 2], angle) -> clean estimate: the network, clamped, moved onto the detections and out of obstacles."""
 
     def __init__(
-        self, model: AbsoluteModel, frame: _Frame, correction: Correction | None, noise: Tensor | None, num_hypotheses: int
+        self,
+        model: AbsoluteModel,
+        frame: "AbsoluteFrame",
+        correction: Correction | None,
+        noise: Tensor | None,
+        num_hypotheses: int,
     ) -> None:
         self.model, self.frame = model, frame
         self.correction = correction if model.sampling.inpainting == "smoother" else None
         self.noise, self.num_hypotheses = noise, num_hypotheses
-        config = model.config
-        nodes = frame.nodes
-        position = (nodes.position_m - frame.centre_m[:, None]) / config.scale_m
-        age = -nodes.time_s / config.step_s / config.age_scale_steps
-        self.rows, self.is_observed = detection_rows(age, position, nodes.is_observed, config.network.max_detections)
+        self.rows, self.is_observed = frame.detection_rows(model.config)
         self.code = self._encoded(1).repeat_interleave(num_hypotheses, dim=0)
         self.constraints: Sequence[Constraint] = ()
         self.scale_m: Tensor | None = None
         if model.sampling.guidance == "clean" and correction is not None:
             self.constraints = _constraints(model, frame)
-            self.scale_m = correction.sigma[:, None, :, None] * config.scale_m
+            self.scale_m = correction.sigma[:, None, :, None] * model.config.scale_m
 
     def __call__(self, noisy: Tensor, angle: float) -> Tensor:
         model = self.model
@@ -312,7 +324,7 @@ def detection_rows(age: Tensor, position: Tensor, is_observed: Tensor, keep: int
     return torch.where(is_kept[..., None], rows, 0.0).float(), is_kept
 
 
-def _constraints(model: AbsoluteModel, frame: _Frame) -> tuple[Constraint, ...]:
+def _constraints(model: AbsoluteModel, frame: "AbsoluteFrame") -> tuple[Constraint, ...]:
     found: list[Constraint] = []
     if model.obstacles.count:
         found.append(ObstacleConstraint(model.obstacles, model.sampling.margin_m, frame.datum_m[:, None, None]))

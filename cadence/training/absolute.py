@@ -5,8 +5,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from cadence.bank.rows import active_rows
+from cadence.diffusion.absolute import AbsoluteConfig, absolute_frame
 from cadence.diffusion.schedule import Schedule, target_of
 from cadence.network.trajectory import TrajectoryNetwork
+from cadence.worlds.recordings import ForecastWindows
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,6 +48,16 @@ def join_absolute(parts: list[AbsoluteWindows]) -> AbsoluteWindows:
         torch.cat([part.is_observed for part in parts]),
         torch.cat(extras) if extras else None,
     )
+
+
+def forecast_rows(windows: ForecastWindows, config: AbsoluteConfig) -> AbsoluteWindows:
+    """Forecasting windows in the network's units; those without any detection are left out. They are known to the last step."""
+    nodes, _ = active_rows(windows.windows)
+    window, agent = windows.windows.is_active.nonzero(as_tuple=True)
+    frame = absolute_frame(nodes, window, agent, windows.context, config)
+    clean = ((windows.truth_m[window, agent] - frame.centre_m[:, None]) / config.scale_m).float()
+    is_known = torch.ones(clean.shape[:2], dtype=torch.bool)
+    return AbsoluteWindows(clean, is_known, *frame.detection_rows(config), None if frame.extra is None else frame.extra[:, 0])
 
 
 def absolute_loss(

@@ -10,15 +10,20 @@ import torch
 from cadence.diffusion.absolute import AbsoluteConfig, AbsoluteSampling
 from cadence.errors import ConfigError, InputError
 from cadence.network.trajectory import TrajectoryNetwork, TrajectoryNetworkConfig
+from cadence.training.absolute import forecast_rows
 from cadence.training.loop import OptimiserConfig
 from cadence.worlds.patrol import PatrolConfig, simulate_patrol
+from cadence.worlds.recordings import Recordings, cut_windows
 from pipeline.absolute import absolute_grid, load_absolute, placed
 from pipeline.checkpoints import CheckpointInfo, read_info, save_checkpoint
 from pipeline.config import config_as_dict, read_config
+from pipeline.forecasters import load_forecaster
 from pipeline.progress import Progress
+from pipeline.recordings import RecordingsConfig, save_recordings
 from pipeline.simulate import SimulateConfig, simulate
 from pipeline.train import TrainConfig, train
 from pipeline.train_absolute import AbsoluteTraining, draw_windows, mission_windows
+from pipeline.training_episodes import EpisodeSource
 from pipeline.training_tables import mission_of_episode, missions_of_logs
 from pipeline.windows import build_windows, plan_grid
 
@@ -85,33 +90,8 @@ def test_relative_windows_forget_where_they_are(episode):
 def test_a_killed_training_goes_on_and_ends_as_an_unbroken_one(tmp_path):
     whole = train(tmp_path / "whole", config(), QUIET)
 
-    class Killed(Exception):
-        pass
-
-    class Bar:
-        def __init__(self):
-            self.count = 0
-
-        def __enter__(self):
-            return self
-
-        def __exit__(self, *args):
-            return None
-
-        def update(self, n):
-            self.count += n
-            if self.count == 3:
-                raise Killed
-
-        def set_postfix_str(self, text):
-            pass
-
-    class Killer(Progress):
-        def bar(self, total, label, unit="it", scale=False):
-            return Bar()
-
-    with pytest.raises(Killed):
-        train(tmp_path / "broken", config(), Killer(quiet=True))
+    with pytest.raises(KeyboardInterrupt):
+        train(tmp_path / "broken", config(), _Stopping(quiet=True))
     again = train(tmp_path / "broken", config(), QUIET)
     assert again.summary["steps"] == 4
     for name in ("checkpoint.safetensors", "curve.csv"):
@@ -137,10 +117,128 @@ def test_a_checkpoint_samples_the_grid_it_asks_for(episode, tmp_path):
         load_absolute(weights)
 
 
+FORECAST = TrajectoryNetworkConfig(
+    width=8, multipliers=(1, 2), num_blocks=1, encoder_size=8, level_size=8, max_detections=6, known_goal=True, elapsed=True
+)
+
+
+def recordings(seed=0, num=6, step_s=60.0):
+    rng = np.random.default_rng(seed)
+    length = rng.integers(20, 60, num)
+    total = int(length.sum())
+    return Recordings(
+        step_s,
+        np.concatenate([[0], np.cumsum(length)]),
+        np.cumsum(rng.normal(0, 40, (total, 2)), axis=0).astype(np.float32),
+        rng.random(total) < 0.4,
+        rng.normal(0, 2000, (total, 2, 2)).astype(np.float32),
+        rng.normal(0, 2000, (num, 2)).astype(np.float32),
+    )
+
+
+def test_forecasting_windows_are_the_truth_in_network_units():
+    """Goal and elapsed share, the last detections with the start among them, and the target parked after the end."""
+    rec = recordings()
+    rec.is_detected[:2] = False, True
+    model = AbsoluteConfig(FORECAST, centre_m=(300.0, -200.0), scale_m=4000.0)
+    episode, step = np.array([0, 1, 2]), np.array([1, 10, int(rec.length[2]) - 2])
+    found = forecast_rows(cut_windows(rec, episode, step, num_detections=6), model)
+    for row, (e, t) in enumerate(zip(episode, step, strict=True)):
+        begin, end = rec.offset[e], rec.offset[e + 1]
+        rows = np.minimum(begin + t + np.arange(120), end - 1)
+        np.testing.assert_allclose(found.clean[row] * 4000.0, rec.position_m[rows] - [300.0, -200.0], atol=0.01)
+        seen = np.flatnonzero(rec.is_detected[begin : begin + t + 1] | (np.arange(t + 1) == 0))[-6:]
+        assert int(found.is_observed[row].sum()) == len(seen)
+        np.testing.assert_allclose(found.rows[row, : len(seen), 0] * 4320, t - seen, atol=1e-3)
+        places = rec.position_m[begin + seen] - [300.0, -200.0]
+        np.testing.assert_allclose(found.rows[row, : len(seen), 1:] * 4000.0, places, atol=0.01)
+        np.testing.assert_allclose(found.extra[row, :2] * 4000.0, rec.known_goal_m[e] - [300.0, -200.0], atol=0.01)
+        assert float(found.extra[row, 2]) == pytest.approx(t / 4320)
+    assert found.is_known.all() and torch.equal(found.clean[2, 1], found.clean[2, 119])
+
+
+@pytest.fixture
+def of_episodes(tmp_path):
+    save_recordings(tmp_path / "a.npz", recordings(0))
+    save_recordings(tmp_path / "b.npz", recordings(1))
+    sources = tuple(
+        EpisodeSource(share, RecordingsConfig(data=tmp_path / name)) for share, name in ((1.0, "a.npz"), (3.0, "b.npz"))
+    )
+    paper = AbsoluteTraining(FORECAST, sources=sources, hidden_goals=0.5, num_validation_windows=20)
+    return dataclasses.replace(config(), paper=paper, optimiser=OptimiserConfig(num_steps=4, warm_up_steps=1, bf16=True))
+
+
+def test_training_from_episodes_goes_on_where_it_was_and_forecasts(of_episodes, tmp_path):
+    whole = train(tmp_path / "whole", of_episodes, QUIET)
+    with pytest.raises(KeyboardInterrupt):
+        train(tmp_path / "killed", of_episodes, _Stopping())
+    train(tmp_path / "killed", of_episodes, QUIET)
+    for name in ("checkpoint.safetensors", "curve.csv"):
+        assert (tmp_path / "killed" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
+    model = load_absolute(whole.outputs[0], AbsoluteSampling("dpmpp", 2))
+    first = [recordings(seed).select(slice(0, 5)).position_m for seed in (0, 1)]  # the last episode of each is for validation
+    assert model.config.scale_m == pytest.approx(1.02 * max(np.ptp(np.concatenate(first), axis=0)) / 2)
+    cut = cut_windows(recordings(2), np.array([0, 1]), np.array([10, 5]))
+    found = model.placed(cut.context).sample(cut.windows, 2).position_m
+    assert found.shape == (2, 2, 1, 120, 2) and bool(found.isfinite().all())
+    nobody = dataclasses.replace(cut.context, known_goal_m=torch.full((2, 1, 2), torch.nan))
+    assert load_forecaster(str(whole.outputs[0])).placed(nobody, None).config.optional_goal
+    hidden = model.placed(nobody).sample(cut.windows, 2).position_m
+    assert bool(hidden.isfinite().all()) and not torch.allclose(hidden, found, atol=0.01)
+    strict = dataclasses.replace(model, config=dataclasses.replace(model.config, optional_goal=False))
+    with pytest.raises(ConfigError, match="goal"):
+        strict.placed(nobody).sample(cut.windows, 2)
+
+
+def test_episodes_that_do_not_fit(of_episodes, tmp_path):
+    with pytest.raises(ConfigError, match="both"):
+        train(tmp_path / "out", dataclasses.replace(of_episodes, data=tmp_path), QUIET)
+    save_recordings(tmp_path / "slow.npz", recordings(0, step_s=30.0))
+    save_recordings(tmp_path / "one.npz", recordings(0, 1))
+    for name, words in (("slow.npz", "step_s"), ("one.npz", "single episode")):
+        source = (EpisodeSource(1.0, RecordingsConfig(data=tmp_path / name)),)
+        paper = dataclasses.replace(of_episodes.paper, sources=source)
+        with pytest.raises(ConfigError, match=words):
+            train(tmp_path / "out", dataclasses.replace(of_episodes, paper=paper), QUIET)
+    for changes in ({"history_steps": 2}, {"hidden_goals": 1.5}, {"sources": ()}):
+        with pytest.raises(ValueError):
+            dataclasses.replace(of_episodes.paper, **changes)
+    with pytest.raises(ValueError, match="sources"):
+        AbsoluteTraining(validation=of_episodes.paper.sources)
+
+
+class _Stopping(Progress):
+    """Interrupts at the third step."""
+
+    def bar(self, total, label, unit="it", scale=False):
+        return _Bar()
+
+
+class _Bar:
+    def __init__(self):
+        self.count = 0
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        return None
+
+    def update(self, count):
+        self.count += count
+        if self.count == 3:
+            raise KeyboardInterrupt
+
+    def set_postfix_str(self, text):
+        del text
+
+
 def test_training_from_logs(tmp_path):
     """Whole logs are kept for validation; map limits come from the others; logs that cannot be used are left out."""
     logs = tmp_path / "logs"
-    simulate(logs, SimulateConfig(num_episodes=3, duration_s=3600.0, step_s=30.0, detection_rate=0.4), QUIET)
+    simulate(
+        logs, SimulateConfig(num_episodes=3, patrol=PatrolConfig(duration_s=3600.0, step_s=30.0, detection_rate=0.4)), QUIET
+    )
     (logs / "broken.mcap").write_bytes(b"not an mcap")
     missions = missions_of_logs(logs, tmp_path / "run" / "logs", PAPER.extract, QUIET)
     assert [mission.name for mission in missions] == [f"patrol-0-000{i}" for i in range(3)]

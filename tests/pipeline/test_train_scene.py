@@ -22,7 +22,8 @@ from pipeline.recordings import RecordingsConfig, save_recordings
 from pipeline.scene import load_scene
 from pipeline.tables import Frame, read_table, write_table
 from pipeline.train import TrainConfig, train
-from pipeline.train_scene import SceneSource, SceneTraining
+from pipeline.train_scene import SceneTraining
+from pipeline.training_episodes import EpisodeSource
 from schemas.tables import DETECTIONS
 
 QUIET = Progress(quiet=True)
@@ -53,7 +54,7 @@ def sources(tmp_path_factory):
     found = []
     for seed, num_trackers in ((0, 2), (1, 4)):
         save_recordings(folder / f"{seed}.npz", recordings(seed, num_trackers))
-        found.append(SceneSource(1.0 + seed, RecordingsConfig(data=folder / f"{seed}.npz")))
+        found.append(EpisodeSource(1.0 + seed, RecordingsConfig(data=folder / f"{seed}.npz")))
     return tuple(found)
 
 
@@ -71,7 +72,9 @@ def test_a_killed_training_goes_on_to_the_same_weights(sources, tmp_path):
     again = train(tmp_path / "killed", config(sources), QUIET)
     first, second = (load_scene(result.outputs[0]).network.state_dict() for result in (whole, again))
     assert all(torch.equal(first[name], second[name]) for name in first)
-    steps = [int(row[0]) for row in csv.reader((tmp_path / "killed" / "curve.csv").read_text().splitlines()) if row[0].isdigit()]
+    steps = [
+        int(row[0]) for row in csv.reader((tmp_path / "killed" / "curve.csv").read_text().splitlines()) if row[0].isdigit()
+    ]
     assert steps == [2, 4]
 
 
@@ -89,11 +92,11 @@ def test_energy_tunes_a_trained_network_for_few_steps(sources, tmp_path):
 
 def test_episodes_with_another_step_are_refused(sources, tmp_path):
     save_recordings(tmp_path / "slow.npz", recordings(0, step_s=30.0))
-    slow = (SceneSource(1.0, RecordingsConfig(data=tmp_path / "slow.npz")),)
+    slow = (EpisodeSource(1.0, RecordingsConfig(data=tmp_path / "slow.npz")),)
     with pytest.raises(ConfigError, match="step_s"):
         train(tmp_path / "out", config(slow), QUIET)
     with pytest.raises(InputError, match="nowhere"):
-        train(tmp_path / "out", config((SceneSource(1.0, RecordingsConfig(data=tmp_path / "nowhere.npz")),)), QUIET)
+        train(tmp_path / "out", config((EpisodeSource(1.0, RecordingsConfig(data=tmp_path / "nowhere.npz")),)), QUIET)
 
 
 def test_infer_takes_a_scene_checkpoint(sources, tmp_path, mission_directory):
