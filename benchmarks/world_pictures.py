@@ -11,9 +11,10 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.patches import Circle
 from PIL import Image
 
-from cadence.worlds import narco, ocean
+from cadence.worlds import narco, ocean, prison, prison_map
 from cadence.worlds.recordings import Recordings
 
 NUM_EPISODES = 100
@@ -52,6 +53,30 @@ def draw_narco() -> Figure:
     return figure
 
 
+def draw_prison() -> Figure:
+    """Coverage, the mountain, cameras, the sites of hideouts, and the ways of the fugitive."""
+    ground = prison_map.prison_map()
+    episodes = prison.simulate_prison_batch(prison.PrisonConfig("low"), 0, np.arange(NUM_EPISODES))
+    figure, axes = plt.subplots(figsize=(8.2, 7.5), layout="constrained")
+    side = prison_map.SIDE
+    # A quarter of the cells and a dozen shades are enough for the eye, and keep the file small.
+    coverage = np.where(ground.is_mountain, np.nan, ground.coverage)[::4, ::4].T
+    axes.set_facecolor("#8d8478")
+    shades = plt.get_cmap("YlGn_r", 12)
+    shown = axes.imshow(coverage, origin="lower", extent=(0, side, 0, side), cmap=shades, vmin=0.0, vmax=0.8, alpha=0.8)
+    figure.colorbar(shown, ax=axes, label="coverage: factor on detection ranges", shrink=0.75)
+    draw_tracks(axes, episodes, prison_map.CELL_M)
+    axes.add_patch(Circle(prison_map.MOUNTAIN, prison_map.KEEP_OUT, fill=False, ec=_INK, ls=":", lw=1.2))
+    axes.plot(*prison_map.SEEN_CAMERAS.T, "^", color=_INK, ms=4, label="cameras the fugitive knows")
+    axes.plot(*prison_map.HIDDEN_CAMERAS.T, "^", color=_CAUGHT, ms=4, label="cameras it does not know")
+    axes.plot(*prison_map.UNKNOWN_SITES.T, "*", color=_GOAL, mec="white", mew=0.6, ms=12, label="hideouts")
+    axes.plot(*prison_map.KNOWN_SITES.T, "D", color=_VIA, mec="white", mew=0.6, ms=6, label="hideouts, known to trackers")
+    axes.set(xlabel="east [cells of 21 m]", ylabel="north [cells of 21 m]", title="World prison, set low")
+    axes.set(xlim=(0, side), ylim=(0, side))
+    figure.legend(loc="outside lower center", fontsize=8, ncols=3)
+    return figure
+
+
 def save(figure: Figure, path: Path) -> None:
     """Write a figure as a PNG of 256 colours, which keeps it small."""
     buffer = io.BytesIO()
@@ -70,6 +95,7 @@ def main() -> None:
     folder = parser.parse_args().publish
     folder.mkdir(parents=True, exist_ok=True)
     save(draw_narco(), folder / "world-narco.png")
+    save(draw_prison(), folder / "world-prison.png")
 
 
 if __name__ == "__main__":
