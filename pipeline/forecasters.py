@@ -1,28 +1,25 @@
-"""Who forecasts: trained checkpoints by their preset, and rivals that need no training of their own, by name."""
+"""Who forecasts: trained checkpoints by their preset, and rivals that are fitted to episodes in seconds, by name."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
-import numpy as np
-
 from cadence.baselines.kalman import ConstantVelocityKalman, OrnsteinUhlenbeckKalman
 from cadence.baselines.library import TrajectoryLibrary
+from cadence.baselines.particle import ParticleFilter
+from cadence.baselines.recorded_kalman import RecordedKalman
 from cadence.constraints.obstacles import Obstacles
 from cadence.diffusion.absolute import AbsoluteSampling
 from cadence.diffusion.scene import SceneSampling
 from cadence.errors import ConfigError
-from cadence.types import Context, Detections, Estimator
-from cadence.worlds.recordings import Recordings, cut_windows
+from cadence.types import Context, Estimator
+from cadence.worlds.recordings import Recordings
 from pipeline.absolute import load_absolute
 from pipeline.checkpoints import find_checkpoint, read_info
 from pipeline.scene import load_scene
 from pipeline.train_rivals import load_rival
 from pipeline.training_run import OUTPUTS
-
-_NUM_FITTED = 64
-"""Detections an episode, the last ones, that models of motion are fitted to."""
 
 
 class Forecaster(Protocol):
@@ -130,49 +127,24 @@ def label_of(name: str) -> str:
     return path.resolve().parent.name if path.name == OUTPUTS[0] else path.stem if name.endswith(".safetensors") else name
 
 
-@dataclass(frozen=True, eq=False)
-class RivalData:
-    """What rivals may learn from.
-
-    seen      the evaluated episodes: only their detections may be looked at
-    training  other episodes, truth and all; None: there are none
-    """
-
-    seen: Recordings
-    training: Recordings | None
-    known_start: bool = True
-
-    def stretches(self) -> Detections:
-        """The last detections of each episode as one row [E, 1, N], for fitting; of training episodes where there are some."""
-        recordings = self.seen if self.training is None else self.training.select(slice(0, 200))
-        last = recordings.length - 1
-        windows = cut_windows(
-            recordings, np.arange(len(recordings)), last, known_start=self.known_start, num_detections=_NUM_FITTED
-        )
-        return windows.windows.detections
-
-    def library(self) -> Recordings:
-        """The training episodes. `ConfigError` where there are none."""
-        if self.training is None:
-            raise ConfigError(
-                "evaluate.forecast.rivals: this rival remembers training episodes; set evaluate.forecast.training, "
-                "or leave it out"
-            )
-        return self.training
+def _cv(training: Recordings) -> Forecaster:
+    return Anywhere(RecordedKalman.from_recordings(training, ConstantVelocityKalman()))
 
 
-def _cv(data: RivalData) -> Forecaster:
-    return Anywhere(ConstantVelocityKalman().fit(data.stretches(), data.seen.step_s))
+def _ou(training: Recordings) -> Forecaster:
+    return Anywhere(RecordedKalman.from_recordings(training, OrnsteinUhlenbeckKalman()))
 
 
-def _ou(data: RivalData) -> Forecaster:
-    return Anywhere(OrnsteinUhlenbeckKalman().fit(data.stretches(), data.seen.step_s))
+def _particle(training: Recordings) -> Forecaster:
+    return Anywhere(ParticleFilter.from_recordings(training))
 
 
-def _library(data: RivalData) -> Forecaster:
-    return Unguided(TrajectoryLibrary.from_recordings(data.library()))
+def _library(training: Recordings) -> Forecaster:
+    return Unguided(TrajectoryLibrary.from_recordings(training))
 
 
-FORECAST_RIVALS: Mapping[str, Callable[[RivalData], Forecaster]] = {"cv": _cv, "ou": _ou, "library": _library}
-"""cv, ou: Kalman filters with constant velocity and with Ornstein-Uhlenbeck velocity, fitted to detections by likelihood;
-library: continuations of the training episodes that resemble the window."""
+FORECAST_RIVALS: Mapping[str, Callable[[Recordings], Forecaster]] = {
+    "cv": _cv, "ou": _ou, "particle": _particle, "library": _library,
+}  # fmt: skip
+"""cv, ou: Kalman filters with constant velocity and with Ornstein-Uhlenbeck velocity, fitted to the training episodes;
+particle: a particle filter whose motion has their moments; library: continuations of those that resemble the window."""

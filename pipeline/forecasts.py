@@ -29,7 +29,7 @@ from pipeline.checkpoints import checkpoint_hash, find_checkpoint
 from pipeline.config import config_as_dict
 from pipeline.forecast_scores import HORIZONS, EpisodeScores, score_forecasts
 from pipeline.forecast_tables import ForecastFacts, as_csv, as_json, as_markdown, headline, pool
-from pipeline.forecasters import FORECAST_RIVALS, Forecaster, RivalData, Samplings, label_of, load_forecaster
+from pipeline.forecasters import FORECAST_RIVALS, Forecaster, Samplings, label_of, load_forecaster
 from pipeline.manifest import StageResult, hash_file, run_stage, write_atomic
 from pipeline.progress import Progress
 from pipeline.provenance import versions
@@ -58,7 +58,7 @@ class ForecastConfig:
     num_resamples   bootstrap resamples of an interval, over episodes
     seed            of the choice of windows, of the hypotheses and of the bootstrap
     recordings      how episodes are read from the logs; the folder of the call is its data
-    training        episodes that rivals may learn from; without it none
+    training        episodes that the rivals learn from; needed by all of them
     paper, scene    how checkpoints of these presets are sampled
     """
 
@@ -68,7 +68,7 @@ class ForecastConfig:
     known_goal: bool = True
     trackers: bool = True
     obstacles: bool = True
-    rivals: tuple[str, ...] = ("cv",)
+    rivals: tuple[str, ...] = ()
     checkpoints: tuple[str, ...] = ()
     num_resamples: int = 1000
     seed: int = 0
@@ -81,6 +81,8 @@ class ForecastConfig:
         unknown = [name for name in self.rivals if name not in FORECAST_RIVALS]
         if unknown:
             raise ValueError(f"rival {unknown[0]!r} is not known; known rivals: {', '.join(FORECAST_RIVALS)}")
+        if self.rivals and self.training is None:
+            raise ValueError("rivals learn from other episodes: set training, or leave the rivals out")
         if min(self.num_windows, self.num_hypotheses, self.num_resamples) < 1 or self.seed < 0:
             raise ValueError("num_windows, num_hypotheses and num_resamples must be at least 1, seed not negative")
 
@@ -115,16 +117,20 @@ def evaluate_forecasts(
         # Beside the results, not inside the working folder: what a killed call has done is to be found again.
         cache = out / "cache"
         episodes = load_recordings(source, cache, progress)
-        training = None if config.training is None else load_recordings(config.training, cache, progress).recordings
         windows = forecast_windows(episodes.recordings, config)
         run = ForecastRun(episodes, windows, config.num_hypotheses, cache / "scores", progress, config.obstacles)
-        data = RivalData(episodes.recordings, training, config.known_start)
+
+        @functools.cache
+        def training() -> Recordings:
+            assert config.training is not None  # refused by the configuration
+            return load_recordings(config.training, cache, progress).recordings
+
         scores = {
             label: run.score(label, functools.partial(_same, forecasters[label]), [checkpoint_hash(path), samplings])
             for label, path in zip(forecasters, weights, strict=True)
         }
         for name in config.rivals:
-            scores[name] = run.score(name, functools.partial(FORECAST_RIVALS[name], data), [name, config.training])
+            scores[name] = run.score(name, functools.partial(_fitted, name, training), [name, config.training])
         report = pool(scores, truth_scores(episodes, windows), facts_of(episodes, windows, config), config.num_resamples)
         write_atomic(work / "forecast.json", as_json(report))
         write_atomic(work / "forecast.csv", as_csv(report))
@@ -141,6 +147,10 @@ def evaluate_forecasts(
 
 def _same(forecaster: Forecaster) -> Forecaster:
     return forecaster
+
+
+def _fitted(name: str, training: Callable[[], Recordings]) -> Forecaster:
+    return FORECAST_RIVALS[name](training())
 
 
 def forecast_windows(recordings: Recordings, config: ForecastConfig) -> ForecastWindows:

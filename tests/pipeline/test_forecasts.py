@@ -21,7 +21,7 @@ from pipeline.checkpoints import CheckpointInfo, save_checkpoint
 from pipeline.config import config_as_dict, read_config
 from pipeline.evaluate import EvaluateConfig, evaluate_any
 from pipeline.forecast_scores import EpisodeScores
-from pipeline.forecasters import Anywhere, RivalData, label_of
+from pipeline.forecasters import FORECAST_RIVALS, Anywhere, label_of
 from pipeline.forecasts import ForecastConfig, ForecastRun, evaluate_forecasts, forecast_windows, truth_scores
 from pipeline.progress import Progress
 from pipeline.recordings import RecordingsConfig, load_recordings
@@ -225,15 +225,23 @@ def test_an_estimator_without_an_answer_is_an_error_and_not_a_score(tmp_path: Pa
         run_on(long_folder(tmp_path), None).score("silent", lambda: Anywhere(Silent()), [])
 
 
-def test_a_library_without_episodes_is_refused(folder: Path) -> None:
-    rec = load_recordings(RecordingsConfig(data=folder), folder.parent / "read", QUIET).recordings
-    with pytest.raises(ConfigError, match="training"):
-        RivalData(rec, None).library()
-    assert RivalData(rec, None).stretches().count.tolist() == [[5], [5], [6]]
+@pytest.mark.parametrize("name", FORECAST_RIVALS)
+def test_every_rival_forecasts(tmp_path: Path, name: str) -> None:
+    run = run_on(long_folder(tmp_path), None)
+    found = run.score(name, lambda: FORECAST_RIVALS[name](run.episodes.recordings), [])
+    assert found.count.sum() == 30 and np.isfinite(found.sums).all()
+    assert found.mean("mean_error")[0] < 400.0  # at most four steps of 50 m since the last detection
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"rivals": ["nobody"]}, {"num_windows": 0}, {"recordings": {"num_episodes": 0}}, {"paper": {"num_steps": 0}}]
+    "wrong",
+    [
+        {"rivals": ["nobody"]},
+        {"rivals": ["library"]},
+        {"num_windows": 0},
+        {"recordings": {"num_episodes": 0}},
+        {"paper": {"num_steps": 0}},
+    ],
 )
 def test_settings_that_cannot_be_are_refused(wrong: dict[str, object]) -> None:
     with pytest.raises(ConfigError):
