@@ -113,6 +113,10 @@ class SceneInputs:
         """A selection of windows."""
         return SceneInputs(**{name: value[pick] for name, value in vars(self).items()})
 
+    def repeated(self, times: int) -> "SceneInputs":
+        """Every window `times` times in a row."""
+        return self[torch.arange(len(self)).repeat_interleave(times)]
+
 
 class SceneNetwork(nn.Module):
     """v-prediction of tracks as pieces [R, P, 2]; num_row, num_summary, num_tracker are the features in `SceneInputs`."""
@@ -146,14 +150,22 @@ class SceneNetwork(nn.Module):
 
     def forward(self, noisy: Tensor, angle: Tensor, pieces: Pieces, code: Tensor) -> Tensor:
         """The velocity [R, P, 2] for noisy [R, P, 2] at noise levels `angle` [R], windows of codes [R, C]."""
+        condition = torch.cat([code, self.level_code(angle)], dim=-1)
+        answer: Tensor = self.unet(self.features(noisy, angle, pieces).mT, condition)
+        return answer.mT
+
+    def features(self, noisy: Tensor, angle: Tensor, pieces: Pieces) -> Tensor:
+        """What the U-Net sees of noisy tracks [R, P, 2] at noise levels `angle` [R]: [R, P, features]."""
         moved = torch.cos(angle)[:, None, None] * noisy * pieces.span[..., None]
         offset = moved.cumsum(dim=1)
         ends = pieces.last[:, None] + offset
         times = torch.stack([pieces.start / 100.0, pieces.duration / 10.0, (pieces.start >= 0).to(noisy.dtype)], dim=-1)
-        features = [noisy, ends.clamp(-1.5, 1.5), (4.0 * offset).clamp(-6.0, 6.0), times, self._read(ends)]
-        condition = torch.cat([code, self.level(angle * _LEVEL_SCALE)], dim=-1)
-        answer: Tensor = self.unet(torch.cat(features, dim=-1).mT, condition)
-        return answer.mT
+        return torch.cat([noisy, ends.clamp(-1.5, 1.5), (4.0 * offset).clamp(-6.0, 6.0), times, self._read(ends)], dim=-1)
+
+    def level_code(self, angle: Tensor) -> Tensor:
+        """The vector that stands for a noise level [R] -> [R, level_size]."""
+        code: Tensor = self.level(angle * _LEVEL_SCALE)
+        return code
 
     def _read(self, place: Tensor) -> Tensor:
         """The learned map at places [R, P, 2] -> [R, P, channels]."""

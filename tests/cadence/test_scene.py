@@ -157,6 +157,16 @@ def test_guidance_and_repair_keep_out_of_obstacles(guidance: str) -> None:
     assert shares[True][0] < 0.02 * unguided and shares[True][1] < 0.02
 
 
+def test_reading_the_detections_again_and_rounding_change_little() -> None:
+    cut = windows()
+    plain = model(SceneSampling(num_steps=3)).placed(cut.context).sample(cut.windows, 3).position_m
+    again = model(SceneSampling(num_steps=3, encode_each_step=True)).placed(cut.context).sample(cut.windows, 3).position_m
+    assert torch.allclose(plain, again, atol=0.5)
+    rounded = model(SceneSampling(num_steps=3, precision="bfloat16")).placed(cut.context).sample(cut.windows, 3).position_m
+    difference = (rounded - plain).norm(dim=-1)
+    assert 0.0 < float(difference.mean()) < 0.2 * CONFIG.unit_step_m
+
+
 def test_refusals_name_what_to_do() -> None:
     cut = windows()
     with pytest.raises(ConfigError, match="step_s = 60"):
