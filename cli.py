@@ -237,7 +237,8 @@ def simulate(
     \b
     Examples:
       cadence simulate --out logs --seed 7
-      cadence simulate --out logs --set simulate.num_episodes=20 --set simulate.detection_rate=0.12
+      cadence simulate --out logs --set simulate.num_episodes=20 --set simulate.patrol.detection_rate=0.12
+      cadence simulate --out logs --set simulate.world=prison --set simulate.prison.set=high
     """
     from pipeline.simulate import SimulateConfig
     from pipeline.simulate import simulate as stage

@@ -262,7 +262,13 @@ def _from_metadata(log: MissionLog, frame: Frame, note: Note) -> list[Json]:
                 found += [_checked({"kind": "circle", **item, "radius_m": item["keep_out_radius_m"]}) for item in mountains]
         except (ConfigError, ValueError, TypeError, LookupError, AttributeError) as error:
             note(f"{where}: obstacles left out ({error})")
-    return found
+    return _once(found)
+
+
+def _once(entries: list[Json]) -> list[Json]:
+    """The entries without circles that stand there already: simulated logs name mountains in both records."""
+    circles = [entry["kind"] == "circle" and (entry["x_m"], entry["y_m"], entry["radius_m"]) for entry in entries]
+    return [entry for index, entry in enumerate(entries) if not circles[index] or circles[index] not in circles[:index]]
 
 
 def _from_record(record: Mapping[str, str], frame: Frame, where: str) -> list[Json]:

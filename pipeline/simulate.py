@@ -4,7 +4,8 @@ import hashlib
 import json
 import os
 import tempfile
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -12,7 +13,10 @@ import numpy as np
 
 from cadence.errors import CadenceError, DeviceError
 from cadence.worlds.episode import Episode, gaps_s
+from cadence.worlds.narco import NarcoConfig, simulate_narco
 from cadence.worlds.patrol import PatrolConfig, simulate_patrol
+from cadence.worlds.prison import PrisonConfig, simulate_prison_episodes
+from cadence.worlds.prison_map import CELL_M
 from pipeline.config import config_as_dict
 from pipeline.logs.forms import Encoding
 from pipeline.logs.mission import MissionForm, write_mission
@@ -23,44 +27,43 @@ from pipeline.provenance import versions
 from pipeline.tables import Frame
 
 STAGE = "simulate"
-VERSION = 1
+VERSION = 2
 """Raised when the same settings make other logs than before: finished episodes are then written anew."""
+
+TOGETHER = 25
+"""Episodes that are simulated at once, where the world is faster so; what is in them does not depend on it."""
 
 
 @dataclass(frozen=True)
 class SimulateConfig:
     """What to simulate, and how to write it.
 
-    world           the only one so far
+    world           patrol: smugglers among islands, watched by boats, an aircraft and masts; prison and narco: the paper's
+                    worlds (Prison Escape, Smuggler), one target and many trackers
     seed            of the whole series of episodes
     num_episodes, first_index  episodes first_index ... first_index + num_episodes - 1 of `seed`; an episode depends on
                                nothing but its index, the seed and the settings below
-    num_agents      targets
-    duration_s, step_s  length of an episode, and time between truth samples
-    detection_rate  mean share of steps with a detection of an agent (episodes differ widely); sets the sensors' ranges
-    line_of_sight   whether land hides targets from the sensors at sea level
     encoding        protobuf, json or cdr; protobuf logs in metres hold JSON detections (no Foxglove type has a covariance)
     georeferenced   positions as latitude and longitude
-    latitude_deg, longitude_deg  of the middle of the map, for georeferenced logs
+    latitude_deg, longitude_deg  of the mission frame's origin, for georeferenced logs: the middle of the map in patrol, its
+                                 south-west corner in prison and narco
     frame_id        name of the frame in the messages
     start_time_s    Unix time of the first message
     """
 
-    world: Literal["patrol"] = "patrol"
+    world: Literal["patrol", "prison", "narco"] = "patrol"
     num_episodes: int = 1
     seed: int = 0
     first_index: int = 0
-    num_agents: int = 1
-    duration_s: float = 7200.0
-    step_s: float = 10.0
-    detection_rate: float = 0.1
-    line_of_sight: bool = True
     encoding: Encoding = "protobuf"
     georeferenced: bool = False
     latitude_deg: float = 59.2
     longitude_deg: float = 20.3
     start_time_s: int = 1700000000
     frame_id: str = "map"
+    patrol: PatrolConfig = field(default_factory=PatrolConfig)
+    prison: PrisonConfig = field(default_factory=PrisonConfig)
+    narco: NarcoConfig = field(default_factory=NarcoConfig)
 
     def __post_init__(self) -> None:
         if self.num_episodes < 1:
@@ -69,16 +72,18 @@ class SimulateConfig:
             raise ValueError("seed, first_index and start_time_s must not be negative")
         if not (abs(self.latitude_deg) <= 85.0 and abs(self.longitude_deg) <= 180.0):
             raise ValueError(f"the datum {self.latitude_deg}, {self.longitude_deg} is not within 85 degrees of the equator")
-        self.world_config()  # refuses what the world cannot do
 
-    def world_config(self) -> PatrolConfig:
-        """The settings that the world itself has."""
-        return PatrolConfig(self.num_agents, self.duration_s, self.step_s, self.detection_rate, self.line_of_sight)
+    @property
+    def stem(self) -> str:
+        """What the names of the logs begin with."""
+        set_name = {"patrol": "", "prison": f"-{self.prison.set}", "narco": f"-{self.narco.set}"}[self.world]
+        return f"{self.world}{set_name}-{self.seed}"
 
     def form(self) -> MissionForm:
         """How the episodes are written."""
         datum = (self.latitude_deg, self.longitude_deg) if self.georeferenced else (None, None)
-        return MissionForm(self.encoding, Frame(self.frame_id, *datum), self.start_time_s * 1_000_000_000)
+        start_ns = self.start_time_s * 1_000_000_000
+        return MissionForm(self.encoding, Frame(self.frame_id, *datum), start_ns, groups_trackers=self.world != "patrol")
 
 
 @dataclass(frozen=True)
@@ -95,6 +100,8 @@ class _Score:
 def simulate(out: Path, config: SimulateConfig, progress: Progress, force: bool = False) -> StageResult:
     """Write the episodes of `config` to `out` as `<world>-<seed>-<index>.mcap`, and `simulate.manifest.json` beside them.
 
+    The paper's worlds have their set in the name: `prison-low-0-0000.mcap`.
+
     Each log appears whole or not at all, and is left alone where an earlier call with the same settings and versions wrote
     it, whatever its `num_episodes` and `first_index`: a call that was killed goes on where it was. The same settings give
     the same bytes. `StageResult.outputs` are the logs in order. Raises `DeviceError` where `out` cannot be written.
@@ -104,14 +111,17 @@ def simulate(out: Path, config: SimulateConfig, progress: Progress, force: bool 
     scores: list[_Score] = []
     num_written = 0
     with progress.bar(len(indices), STAGE, unit="episode") as bar:
-        for index in indices:
-            path = out / f"{config.world}-{config.seed}-{index:04d}.mcap"
-            score = None if force else _finished(path, config, index)
-            if score is None:
-                score = _write_episode(path, config, index)
-                num_written += 1
-            scores.append(score)
-            bar.update(1)
+        for begin in range(0, len(indices), TOGETHER):
+            some = indices[begin : begin + TOGETHER]
+            paths = {index: out / f"{config.stem}-{index:04d}.mcap" for index in some}
+            found = {index: None if force else _finished(path, config, index) for index, path in paths.items()}
+            missing = [index for index in some if found[index] is None]
+            bar.update(len(some) - len(missing))
+            for index, episode in zip(missing, _episodes(config, missing), strict=True):
+                found[index] = _write_episode(paths[index], episode, config, index)
+                bar.update(1)
+            num_written += len(missing)
+            scores += [score for score in found.values() if score is not None]
     manifest = {
         "stage": STAGE,
         "config": config_as_dict(config),
@@ -138,6 +148,7 @@ def _prepare(out: Path) -> None:
 def _key(config: SimulateConfig, index: int) -> str:
     """What an episode's bytes depend on, as a hash."""
     settled = config_as_dict(replace(config, num_episodes=1, first_index=index))
+    settled = {name: value for name, value in settled.items() if name == config.world or not isinstance(value, dict)}
     made_by = {name: versions()[name] for name in ("cadence", "numpy", "mcap")}
     text = json.dumps({"config": settled, "version": VERSION, "made_by": made_by}, sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()
@@ -162,11 +173,21 @@ def _finished(path: Path, config: SimulateConfig, index: int) -> _Score | None:
     return _Score(path.name, hash_file(path), rate, count, tuple(gaps))
 
 
-def _write_episode(path: Path, config: SimulateConfig, index: int) -> _Score:
-    """Simulate one episode and write its log under a temporary name, then rename it."""
-    episode = simulate_patrol(config.world_config(), np.random.default_rng([config.seed, index]))
+def _episodes(config: SimulateConfig, indices: Sequence[int]) -> Iterator[Episode]:
+    """The episodes `indices`, in order."""
+    if config.world == "prison":
+        yield from simulate_prison_episodes(config.prison, config.seed, np.array(indices, dtype=np.int64))
+    for index in indices if config.world != "prison" else ():
+        if config.world == "narco":
+            yield simulate_narco(config.narco, config.seed, index)
+        else:
+            yield simulate_patrol(config.patrol, np.random.default_rng([config.seed, index]))
+
+
+def _write_episode(path: Path, episode: Episode, config: SimulateConfig, index: int) -> _Score:
+    """Write one episode's log under a temporary name, then rename it."""
     is_detected = episode.is_detected()
-    gaps = tuple(float(gap) for agent in is_detected for gap in gaps_s(agent, config.step_s))
+    gaps = tuple(float(gap) for agent in is_detected for gap in gaps_s(agent, _step_s(episode)))
     rate, count = round(float(is_detected.mean()), 6), len(episode.detections)
     mission = _mission_record(episode, config, index)
     mission |= {"measured_detection_rate": rate, "num_detections": count, "gaps_s": gaps, "key": _key(config, index)}
@@ -186,25 +207,50 @@ def _write_episode(path: Path, config: SimulateConfig, index: int) -> _Score:
     return _Score(path.name, digest, rate, count, gaps)
 
 
+def _step_s(episode: Episode) -> float:
+    return float(episode.time_s[1] - episode.time_s[0])
+
+
 def _mission_record(episode: Episode, config: SimulateConfig, index: int) -> dict[str, Any]:
     """The Metadata record `mission`: how the log came about and what its names mean."""
     record: dict[str, Any] = {
         "world": config.world,
         "seed": config.seed,
         "episode": index,
-        "step_s": config.step_s,
+        "step_s": _step_s(episode),
         "duration_s": float(episode.time_s[-1]),
         "start_time_s": config.start_time_s,
         "frame_id": config.frame_id,
         "map_side_m": episode.terrain.side_m,
         "agents": episode.agent_ids,
         "sensors": episode.sensor_ids,
-        "detection_rate": config.detection_rate,
         "goals_m": [np.round(goals, 1).tolist() for goals in episode.goals_m],
     }
     if config.georeferenced:
         record |= {"latitude_deg": config.latitude_deg, "longitude_deg": config.longitude_deg}
-    return record
+    if config.world == "patrol":
+        return record | {"detection_rate": config.patrol.detection_rate}
+    return record | _paper_record(episode, config)
+
+
+def _paper_record(episode: Episode, config: SimulateConfig) -> dict[str, Any]:
+    """What the logs of the paper's worlds say besides, with the keys of the original simulator's recorded logs."""
+    if config.world == "narco":
+        factor = config.narco.detection_factor
+        return {"scenario": "smuggler", "set": config.narco.set, "detection_factor": factor, "hideout_known_to_trackers": []}
+    stays = ["camera" in name for name in episode.sensor_ids]
+    mountains = [
+        dict(zip(("x_m", "y_m", "keep_out_radius_m"), circle, strict=True)) for circle in episode.terrain.circles_m.tolist()
+    ]
+    return {
+        "scenario": "prison_escape",
+        "set": config.prison.set,
+        "detection_factor": config.prison.detection_factor,
+        "cell_m": CELL_M,
+        "mountains": mountains,
+        "hideout_known_to_trackers": episode.goals_m[0][-1:].tolist(),
+        "cameras": episode.sensors_m[stays, 0].tolist(),
+    }
 
 
 def _summary(scores: list[_Score]) -> dict[str, Any]:

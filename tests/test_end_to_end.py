@@ -90,8 +90,8 @@ def test_shipped_checkpoint_is_the_default(log, tmp_path, capsys):
 
 
 def test_simulated_mission_can_be_scored(tmp_path, capsys):
-    simulate = ["simulate", "--out", str(tmp_path / "logs"), "--seed", "5", "--set", "simulate.duration_s=1200"]
-    assert cli.main([*simulate, "--set", "simulate.detection_rate=0.3", "--json", "-q"]) == 0
+    simulate = ["simulate", "--out", str(tmp_path / "logs"), "--seed", "5", "--set", "simulate.patrol.duration_s=1200"]
+    assert cli.main([*simulate, "--set", "simulate.patrol.detection_rate=0.3", "--json", "-q"]) == 0
     (log,) = json.loads(capsys.readouterr().out)["outputs"]
     run(capsys, Path(log), tmp_path / "out", *BANK, "--set", "infer.guidance.mode=none", "--set", "infer.grid.step_s=10")
     assert cli.main(["evaluate", str(tmp_path / "out" / Path(log).stem), "-q", "--set", "evaluate.num_resamples=20"]) == 0

@@ -9,6 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from foxglove_schemas_protobuf.LocationFix_pb2 import LocationFix
 from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
+from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
 from google.protobuf.message import Message
 from mcap.writer import Writer
 from mcap_protobuf.schema import build_file_descriptor_set
@@ -23,6 +24,7 @@ class Report:
     """A position at a time. x and y are metres, or, for geodetic forms, longitude and latitude in degrees.
 
     covariance_m2 is xx, xy, yy (east, north); None for truth and poses. The identities are written where a form has room.
+    Forms of several positions write `group`, x and y each, and not x and y.
     """
 
     time_ns: int
@@ -32,6 +34,7 @@ class Report:
     covariance_m2: tuple[float, float, float] | None = None
     agent_id: str = ""
     sensor_id: str = ""
+    group: tuple[tuple[float, float], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -58,6 +61,13 @@ def pose_form(encoding: Encoding, is_geodetic: bool) -> Form:
     if encoding == "json":
         return _json_fix_form() if is_geodetic else _json_pose_form()
     return _protobuf_form(LocationFix, _protobuf_fix) if is_geodetic else _protobuf_form(PoseInFrame, _protobuf_pose)
+
+
+def group_form(encoding: Encoding) -> Form:
+    """The form of several positions at once, in metres."""
+    if encoding == "cdr":
+        return _cdr_form("geometry_msgs/msg/PoseArray")
+    return _json_group_form() if encoding == "json" else _protobuf_form(PosesInFrame, _protobuf_group)
 
 
 def detection_form(encoding: Encoding, is_geodetic: bool) -> Form:
@@ -89,6 +99,15 @@ def _protobuf_pose(report: Report) -> bytes:
     message.timestamp.FromNanoseconds(report.time_ns)
     message.pose.position.x, message.pose.position.y = report.x, report.y
     message.pose.orientation.w = 1.0
+    return bytes(message.SerializeToString(deterministic=True))
+
+
+def _protobuf_group(report: Report) -> bytes:
+    message = PosesInFrame(frame_id=report.frame_id)
+    message.timestamp.FromNanoseconds(report.time_ns)
+    for x, y in report.group:
+        pose = message.poses.add()
+        pose.position.x, pose.position.y, pose.orientation.w = x, y, 1.0
     return bytes(message.SerializeToString(deterministic=True))
 
 
@@ -126,18 +145,20 @@ def _json_form(
     return Form("json", name, "jsonschema", json.dumps(schema).encode(), encode, has_agent_id)
 
 
+_POSE = {"type": "object", "properties": {"position": _object("xyz"), "orientation": _object("xyzw")}}
+
+
+def _json_pose(x: float, y: float) -> dict[str, Any]:
+    return {"position": {"x": x, "y": y, "z": 0.0}, "orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}}
+
+
 def _json_pose_form() -> Form:
-    pose = {"type": "object", "properties": {"position": _object("xyz"), "orientation": _object("xyzw")}}
-    return _json_form(
-        "foxglove.PoseInFrame",
-        {"pose": pose},
-        lambda report: {
-            "pose": {
-                "position": {"x": report.x, "y": report.y, "z": 0.0},
-                "orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0},
-            }
-        },
-    )
+    return _json_form("foxglove.PoseInFrame", {"pose": _POSE}, lambda report: {"pose": _json_pose(report.x, report.y)})
+
+
+def _json_group_form() -> Form:
+    poses = {"poses": {"type": "array", "items": _POSE}}
+    return _json_form("foxglove.PosesInFrame", poses, lambda report: {"poses": [_json_pose(x, y) for x, y in report.group]})
 
 
 def _json_fix_form() -> Form:
@@ -177,7 +198,12 @@ def _typestore() -> Typestore:
 
 def _cdr_form(name: str) -> Form:
     store = _typestore()
-    fill = {"NavSatFix": _ros_fix, "PoseStamped": _ros_pose, "PoseWithCovarianceStamped": _ros_pose_with_covariance}
+    fill = {
+        "NavSatFix": _ros_fix,
+        "PoseStamped": _ros_pose,
+        "PoseWithCovarianceStamped": _ros_pose_with_covariance,
+        "PoseArray": _ros_poses,
+    }
     make = fill[name.rpartition("/")[2]]
     definition = store.generate_msgdef(name, ros_version=2)[0]
     return Form("cdr", name, "ros2msg", definition.encode(), lambda report: bytes(store.serialize_cdr(make(report), name)))
@@ -189,14 +215,18 @@ def _ros_header(report: Report) -> Any:
     return types["std_msgs/msg/Header"](stamp, report.frame_id)
 
 
-def _ros_pose_at(report: Report) -> Any:
+def _ros_pose_at(x: float, y: float) -> Any:
     types = _typestore().types
-    position = types["geometry_msgs/msg/Point"](report.x, report.y, 0.0)
+    position = types["geometry_msgs/msg/Point"](x, y, 0.0)
     return types["geometry_msgs/msg/Pose"](position, types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0))
 
 
 def _ros_pose(report: Report) -> Any:
-    return _typestore().types["geometry_msgs/msg/PoseStamped"](_ros_header(report), _ros_pose_at(report))
+    return _typestore().types["geometry_msgs/msg/PoseStamped"](_ros_header(report), _ros_pose_at(report.x, report.y))
+
+
+def _ros_poses(report: Report) -> Any:
+    return _typestore().types["geometry_msgs/msg/PoseArray"](_ros_header(report), [_ros_pose_at(x, y) for x, y in report.group])
 
 
 def _ros_pose_with_covariance(report: Report) -> Any:
@@ -204,7 +234,7 @@ def _ros_pose_with_covariance(report: Report) -> Any:
     covariance = np.zeros((6, 6))
     xx, xy, yy = report.covariance_m2 or (0.0, 0.0, 0.0)
     covariance[:2, :2] = [[xx, xy], [xy, yy]]
-    pose = types["geometry_msgs/msg/PoseWithCovariance"](_ros_pose_at(report), covariance.ravel())
+    pose = types["geometry_msgs/msg/PoseWithCovariance"](_ros_pose_at(report.x, report.y), covariance.ravel())
     return types["geometry_msgs/msg/PoseWithCovarianceStamped"](_ros_header(report), pose)
 
 

@@ -1,7 +1,8 @@
 """A simulated episode as a mission log: truth, sensors, detections, obstacles to look at and obstacles to compute with.
 
-Topics: /truth/AGENT and /sensors/SENSOR/pose (positions), /detections (messages that name agent and sensor) or
-/detections/AGENT (messages that have no field for the agent), /scene/obstacles (foxglove.SceneUpdate, protobuf always).
+Topics: /truth/AGENT (positions), /sensors/SENSOR/pose (positions) or /trackers (all sensors that move in one message),
+/detections (messages that name agent and sensor) or /detections/AGENT (messages that have no field for the agent),
+/scene/obstacles (foxglove.SceneUpdate, protobuf always).
 Metadata records: `mission` (JSON values: how the log came about), `cadence.obstacles` (key `obstacles`: the list of
 obstacles.json, in the mission frame, whose datum stands beside it).
 """
@@ -20,12 +21,14 @@ from mcap.writer import Writer
 from cadence.worlds.episode import Episode
 from cadence.worlds.terrain import Terrain
 from pipeline.frames import to_geodetic
-from pipeline.logs.forms import Encoding, Form, Report, detection_form, pose_form, protobuf_schema
+from pipeline.logs.forms import Encoding, Form, Report, detection_form, group_form, pose_form, protobuf_schema
 from pipeline.provenance import versions
 from pipeline.tables import Frame
 
 SCENE_PERIOD_S = 60.0
-"""The obstacles' scene is repeated this often: after a seek, viewers show only what they find near."""
+SCENE_STEPS = 10
+"""The obstacles' scene is repeated so often, but not more than once in so many steps where these are long: after a seek,
+viewers show only what they find near."""
 
 LAND_RGBA = (0.62, 0.68, 0.5, 0.9)
 SHOAL_RGBA = (0.8, 0.72, 0.5, 0.9)
@@ -33,11 +36,16 @@ SHOAL_RGBA = (0.8, 0.72, 0.5, 0.9)
 
 @dataclass(frozen=True)
 class MissionForm:
-    """How an episode is written. The frame's datum is set for positions in latitude and longitude."""
+    """How an episode is written. The frame's datum is set for positions in latitude and longitude.
+
+    With `groups_trackers` the sensors that move are one message a step, and those that do not are left to the Metadata
+    record; no message type has latitudes and longitudes of several, so geodetic logs write every sensor apart.
+    """
 
     encoding: Encoding
     frame: Frame
     start_ns: int
+    groups_trackers: bool = False
 
     @property
     def is_geodetic(self) -> bool:
@@ -101,13 +109,15 @@ def _write_messages(writer: Writer, episode: Episode, form: MissionForm) -> None
     topics = _Topics(writer)
     scene_schema = writer.register_schema("foxglove.SceneUpdate", "protobuf", protobuf_schema(SceneUpdate))
     topics.open("/scene/obstacles", writer.register_channel("/scene/obstacles", "protobuf", scene_schema))
-    scene = _scene(episode.terrain, form.frame.frame_id)
+    scene = _scene(episode.terrain, form.frame.frame_id, "mountain" if episode.world == "prison" else "shoal")
     poses, detections = pose_form(form.encoding, form.is_geodetic), detection_form(form.encoding, form.is_geodetic)
     truth, sensors = _place(episode.truth_m, form), _place(episode.sensors_m, form)
     measured, seen = _place(episode.detections.position_m, form), episode.detections
     moves = (np.diff(episode.sensors_m, axis=1) != 0).any(axis=(1, 2))
     step_ns = np.round(episode.time_s * 1e9).astype(np.int64) + form.start_ns
-    scene_every = max(1, round(SCENE_PERIOD_S / (episode.time_s[1] - episode.time_s[0])))
+    step_s = episode.time_s[1] - episode.time_s[0]
+    scene_every = round(SCENE_PERIOD_S / step_s) if step_s < SCENE_PERIOD_S else SCENE_STEPS
+    group = group_form(form.encoding) if form.groups_trackers and not form.is_geodetic else None
     first, last = np.searchsorted(seen.step, [np.arange(len(step_ns)), np.arange(1, len(step_ns) + 1)])
     frame_id = form.frame.frame_id
     for step, time_ns in enumerate(step_ns.tolist()):
@@ -116,7 +126,10 @@ def _write_messages(writer: Writer, episode: Episode, form: MissionForm) -> None
             topics.append("/scene/obstacles", time_ns, _stamped(scene, time_ns))
         for agent, name in enumerate(episode.agent_ids):
             topics.write(f"/truth/{name}", poses, Report(time_ns, frame_id, *truth[agent, step].tolist()))
-        for sensor, name in enumerate(episode.sensor_ids):
+        if group is not None:
+            places = tuple((x, y) for x, y in sensors[moves, step].tolist())
+            topics.write("/trackers", group, Report(time_ns, frame_id, 0.0, 0.0, group=places))
+        for sensor, name in enumerate(episode.sensor_ids if group is None else ()):
             if moves[sensor] or is_slow_tick:
                 topics.write(f"/sensors/{name}/pose", poses, Report(time_ns, frame_id, *sensors[sensor, step].tolist()))
         for row in range(first[step], last[step]):
@@ -135,8 +148,8 @@ def _place(position_m: np.ndarray[Any, np.dtype[np.float64]], form: MissionForm)
     return np.round(np.stack([longitude, latitude], axis=-1), 8).reshape(position_m.shape)
 
 
-def _scene(terrain: Terrain, frame_id: str) -> SceneUpdate:
-    """Islands as triangles with an outline, shoals as flat cylinders; one self-contained message."""
+def _scene(terrain: Terrain, frame_id: str, name_of_circles: str) -> SceneUpdate:
+    """Islands as triangles with an outline, circles as flat cylinders; one self-contained message."""
     scene = SceneUpdate()
     for index, polygon in enumerate(terrain.polygons_m):
         entity = scene.entities.add(id=f"island_{index + 1}", frame_id=frame_id)
@@ -152,7 +165,7 @@ def _scene(terrain: Terrain, frame_id: str) -> SceneUpdate:
         for x, y in np.round(polygon, 3).tolist():
             shore.points.add(x=x, y=y)
     for index, (x, y, radius) in enumerate(np.round(terrain.circles_m, 3).tolist()):
-        entity = scene.entities.add(id=f"shoal_{index + 1}", frame_id=frame_id)
+        entity = scene.entities.add(id=f"{name_of_circles}_{index + 1}", frame_id=frame_id)
         disc = entity.cylinders.add(bottom_scale=1.0, top_scale=1.0)
         disc.pose.position.x, disc.pose.position.y = x, y
         disc.pose.orientation.w = 1.0

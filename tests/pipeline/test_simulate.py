@@ -15,16 +15,24 @@ from mcap_ros2.decoder import DecoderFactory as RosFactory
 
 from cadence.errors import ConfigError, DeviceError
 from cadence.worlds.episode import Episode
-from cadence.worlds.patrol import simulate_patrol
+from cadence.worlds.narco import NarcoConfig, simulate_narco
+from cadence.worlds.patrol import PatrolConfig, simulate_patrol
+from cadence.worlds.prison import PrisonConfig, simulate_prison, simulate_prison_batch
 from pipeline.config import read_config
 from pipeline.logs.reader import open_log
 from pipeline.manifest import read_manifest
 from pipeline.mapping import suggest_mapping
 from pipeline.progress import Progress
+from pipeline.recordings import RecordingsConfig, load_recordings
 from pipeline.simulate import SimulateConfig, simulate
 
 QUIET = Progress(quiet=True)
-SHORT = SimulateConfig(duration_s=1200.0, seed=6, detection_rate=0.3)
+SHORT = SimulateConfig(seed=6, patrol=PatrolConfig(duration_s=1200.0, detection_rate=0.3))
+
+
+def short(config: SimulateConfig = SHORT, **changes: Any) -> SimulateConfig:
+    """With other settings of the world patrol."""
+    return dataclasses.replace(config, patrol=dataclasses.replace(config.patrol, **changes))
 
 
 def decoded(path: Path) -> Iterator[tuple[str, int, Any]]:
@@ -56,7 +64,7 @@ def position(message: Any) -> tuple[float, float]:
 
 def expected(config: SimulateConfig, index: int = 0) -> Episode:
     """The episode that a log must hold."""
-    return simulate_patrol(config.world_config(), np.random.default_rng([config.seed, index]))
+    return simulate_patrol(config.patrol, np.random.default_rng([config.seed, index]))
 
 
 def metadata(path: Path) -> dict[str, dict[str, str]]:
@@ -96,11 +104,11 @@ def test_counts_agree_with_the_statistics(tmp_path: Path) -> None:
 
 
 def test_metadata_tells_how_the_log_came_about(tmp_path: Path) -> None:
-    (path,) = simulate(tmp_path, dataclasses.replace(SHORT, num_agents=2), QUIET).outputs
+    (path,) = simulate(tmp_path, short(num_agents=2), QUIET).outputs
     mission = {key: json.loads(value) for key, value in metadata(path)["mission"].items()}
     assert mission["world"] == "patrol" and mission["seed"] == 6 and mission["step_s"] == 10.0
     assert mission["agents"] == ["smuggler_1", "smuggler_2"]
-    episode = expected(dataclasses.replace(SHORT, num_agents=2))
+    episode = expected(short(num_agents=2))
     assert mission["measured_detection_rate"] == pytest.approx(episode.is_detected().mean(), abs=1e-6)
 
 
@@ -140,7 +148,7 @@ def test_every_form_says_the_same(tmp_path: Path, encoding: Any, georeferenced: 
 @pytest.mark.parametrize("georeferenced", [False, True])
 @pytest.mark.parametrize("encoding", ["protobuf", "json", "cdr"])
 def test_the_mapping_finds_everything_unaided(tmp_path: Path, encoding: Any, georeferenced: bool) -> None:
-    config = dataclasses.replace(SHORT, encoding=encoding, georeferenced=georeferenced, num_agents=2, duration_s=300.0)
+    config = dataclasses.replace(short(num_agents=2, duration_s=300.0), encoding=encoding, georeferenced=georeferenced)
     (path,) = simulate(tmp_path, config, QUIET).outputs
     mapping = suggest_mapping(open_log(path).channels)
     is_named = not georeferenced and encoding != "cdr"
@@ -167,7 +175,7 @@ def test_finished_episodes_are_left_alone(tmp_path: Path) -> None:
     again = simulate(tmp_path, config, QUIET)
     assert again.status == "skipped" and again.summary == {**more.summary, "num_written": 0}
     assert simulate(tmp_path, config, QUIET, force=True).summary["num_written"] == 3
-    other = simulate(tmp_path, dataclasses.replace(config, detection_rate=0.1), QUIET)
+    other = simulate(tmp_path, short(config, detection_rate=0.1), QUIET)
     assert other.summary["num_written"] == 3
 
 
@@ -230,7 +238,10 @@ def test_an_unwritable_folder_is_one_line(tmp_path: Path) -> None:
         ("num_episodes", 0),
         ("seed", -1),
         ("latitude_deg", 95.0),
-        ("detection_rate", 0.9),
+        ("patrol", {"detection_rate": 0.9}),
+        ("prison", {"set": "mid"}),
+        ("prison", {"factor": -1.0}),
+        ("narco", {"set": "med"}),
         ("world", "mars"),
         ("encoding", "xml"),
     ],
@@ -239,3 +250,77 @@ def test_impossible_settings_are_one_line(key: str, value: Any) -> None:
     with pytest.raises(ConfigError) as caught:
         read_config(SimulateConfig, {key: value}, "simulate")
     assert "\n" not in str(caught.value)
+
+
+PRISON = SimulateConfig(world="prison", seed=4, prison=PrisonConfig("med"))
+
+
+@pytest.fixture(scope="module")
+def prison_log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    (path,) = simulate(tmp_path_factory.mktemp("prison"), PRISON, QUIET).outputs
+    return path
+
+
+def test_a_log_of_the_prison_holds_its_episode(prison_log: Path) -> None:
+    episode = simulate_prison(PRISON.prison, 4, 0)
+    rows = list(decoded(prison_log))
+    truth = np.array([position(m) for topic, _, m in rows if topic == "/truth/fugitive"])
+    np.testing.assert_array_equal(truth, episode.truth_m[0])
+    detections = [m for topic, _, m in rows if topic == "/detections"]
+    assert len(detections) == len(episode.detections) > 0
+    assert [m["sensor_id"] for m in detections] == [episode.sensor_ids[sensor] for sensor in episode.detections.sensor]
+    poses = [[(p.position.x, p.position.y) for p in m.poses] for topic, _, m in rows if topic == "/trackers"]
+    np.testing.assert_array_equal(poses, np.moveaxis(episode.sensors_m[-6:], 0, 1))
+    assert {topic for topic, _, _ in rows} == {"/truth/fugitive", "/detections", "/trackers", "/scene/obstacles"}
+
+
+def test_the_prison_log_has_the_metadata_of_the_original_logs(prison_log: Path) -> None:
+    assert prison_log.name == "prison-med-4-0000.mcap"
+    mission = {key: json.loads(value) for key, value in metadata(prison_log)["mission"].items()}
+    assert (mission["scenario"], mission["step_s"], mission["cell_m"], mission["map_side_m"]) == (
+        "prison_escape",
+        60,
+        21,
+        50988,
+    )
+    assert mission["mountains"] == [{"x_m": 33600.0, "y_m": 37800.0, "keep_out_radius_m": 2940.0}]
+    episode = simulate_prison(PRISON.prison, 4, 0)
+    assert np.shape(mission["hideout_known_to_trackers"]) == (1, 2) and np.shape(mission["cameras"]) == (78, 2)
+    np.testing.assert_array_equal(mission["cameras"], episode.sensors_m[:78, 0])
+    assert mission["detection_factor"] == PRISON.prison.detection_factor
+
+
+@pytest.mark.parametrize("encoding", ["protobuf", "json", "cdr"])
+def test_logs_of_the_prison_are_read_as_the_episodes_they_hold(tmp_path: Path, encoding: Any) -> None:
+    config = dataclasses.replace(PRISON, encoding=encoding, prison=PrisonConfig("low"), first_index=1)
+    simulate(tmp_path / "logs", config, QUIET)
+    found = load_recordings(RecordingsConfig(data=tmp_path / "logs"), tmp_path / "cache", QUIET)
+    made = simulate_prison_batch(config.prison, 4, np.array([1]))
+    for name in ("position_m", "is_detected", "tracker_m", "known_goal_m"):
+        np.testing.assert_allclose(getattr(found.recordings, name), getattr(made, name), atol=0.01, err_msg=name)
+    assert found.scale_m == 50988.0 and len(found.obstacles[0].circles) == 1
+
+
+def test_a_log_of_narco_holds_its_episode(tmp_path: Path) -> None:
+    config = SimulateConfig(world="narco", seed=2, narco=NarcoConfig("high"))
+    (path,) = simulate(tmp_path, config, QUIET).outputs
+    episode = simulate_narco(config.narco, 2, 0)
+    rows = list(decoded(path))
+    truth = np.array([position(m) for topic, _, m in rows if topic == "/truth/smuggler"])
+    np.testing.assert_allclose(truth, episode.truth_m[0], atol=6e-4)
+    poses = [[(p.position.x, p.position.y) for p in m.poses] for topic, _, m in rows if topic == "/trackers"]
+    np.testing.assert_allclose(poses, np.moveaxis(episode.sensors_m, 0, 1), atol=6e-4)
+    assert path.name == "narco-high-2-0000.mcap"
+    assert json.loads(metadata(path)["mission"]["scenario"]) == "smuggler"
+
+
+def test_settings_of_other_worlds_change_nothing(tmp_path: Path) -> None:
+    simulate(tmp_path, SHORT, QUIET)
+    other = dataclasses.replace(SHORT, prison=PrisonConfig("high"))
+    assert simulate(tmp_path, other, QUIET).summary["num_written"] == 0
+
+
+def test_episodes_simulated_together_are_those_simulated_alone(tmp_path: Path) -> None:
+    several = simulate(tmp_path / "a", dataclasses.replace(PRISON, num_episodes=3), QUIET).outputs
+    alone = simulate(tmp_path / "b", dataclasses.replace(PRISON, first_index=2), QUIET).outputs
+    assert several[2].read_bytes() == alone[0].read_bytes()

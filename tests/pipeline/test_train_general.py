@@ -14,6 +14,7 @@ from cadence.errors import InputError
 from cadence.network.residual import ResidualNetworkConfig
 from cadence.training.loop import OptimiserConfig
 from cadence.training.synthetic import SyntheticConfig
+from cadence.worlds.patrol import PatrolConfig
 from pipeline import shards, train_general
 from pipeline.checkpoints import read_info
 from pipeline.config import config_as_dict
@@ -144,7 +145,11 @@ def test_settings_that_mean_nothing() -> None:
 
 
 def logs(folder: Path, num: int, duration_s: float = 5400.0) -> Path:
-    simulate(folder, SimulateConfig(num_episodes=num, duration_s=duration_s, step_s=10.0, detection_rate=0.15), QUIET)
+    simulate(
+        folder,
+        SimulateConfig(num_episodes=num, patrol=PatrolConfig(duration_s=duration_s, step_s=10.0, detection_rate=0.15)),
+        QUIET,
+    )
     return folder
 
 
