@@ -43,7 +43,7 @@ from cadence.worlds.recordings import Recordings
 from cadence.worlds.terrain import Terrain
 
 STEP_S = 60.0
-DETECTION_FACTORS = {"low": 3.3, "med": 6.3, "high": 9.0}
+DETECTION_FACTORS = {"low": 3.3, "med": 6.3, "high": 8.8}
 STUCK_STEPS = 2000
 
 _START_RANGE, _HIDEOUT_RADIUS = 350, 50.0
