@@ -16,7 +16,8 @@ Aircraft work in cycles: 200 steps in the air, 40 at rest, where they keep their
 
 Decided here, where the original does something that cannot be meant: the side on which a mover is, is taken from the whole
 direction and not from its x component, which says nothing of a target that goes north; a line that runs into land ends there,
-as it does at the map's edge, and a spiral breaks off at land; a destination that is not allowed is drawn anew around it.
+as it does at the map's edge, and a spiral breaks off at land (in the original a mover sticks there until the next detection);
+a destination that is not allowed is drawn anew around it.
 `cadence.worlds.prison_search` is the same policy on land, with its rounding to cells and its mountain.
 
 Units are the world's and steps.
