@@ -74,11 +74,12 @@ def scene_inputs(windows: WindowBatch, context: Context, config: SceneConfig) ->
     if windows.num_agents != 1 or not bool(windows.is_active.all()):
         raise ValueError("scene_inputs: windows of one agent with at least one detection each are needed")
     seen = _Seen(windows.detections, context, config)
-    goal, is_goal = _goal(context, config)
+    goal, is_goal = _goal(context, config, seen.last)
     elapsed = seen.age[:, :1] if context.elapsed_s is None else (context.elapsed_s.float() / config.step_s)[:, None]
     trackers, is_tracker = _trackers(context, config, seen.last)
     rows, is_observed = seen.rows(config.network.max_detections)
-    summary = [*seen.summary(elapsed), is_goal, goal, octaves(seen.last, _NUM_OCTAVES), octaves(goal, _NUM_OCTAVES) * is_goal]
+    last = seen.told("absolute", octaves(seen.last, _NUM_OCTAVES))
+    summary = [*seen.summary(elapsed), is_goal, goal, last, octaves(goal, _NUM_OCTAVES) * is_goal]
     pieces = _pieces(seen.last, seen.last_age, config)
     return SceneInputs(rows, is_observed, torch.cat(summary, dim=-1), trackers, is_tracker, pieces)
 
@@ -89,11 +90,16 @@ class _Seen:
     def __init__(self, detections: Detections, context: Context, config: SceneConfig) -> None:
         centre = torch.tensor(config.centre_m, dtype=torch.float64)
         self.unit = config.unit_step_m / config.scale_m
+        self.places = config.network.places
         self.age = (-detections.time_s[:, 0] / config.step_s).float()
         self.place = ((detections.position_m[:, 0] + context.datum_m[:, None] - centre) / config.scale_m).float()
         self.count = detections.is_observed[:, 0].sum(dim=1)
         self.last_age = self.age.gather(1, (self.count - 1)[:, None])
         self.last = self._place_at((self.count - 1)[:, None])[:, 0]
+
+    def told(self, kind: str, values: Tensor) -> Tensor:
+        """Absolute or relative `values`, or zeros where places are not told in this way."""
+        return values if self.places in ("both", kind) else torch.zeros_like(values)
 
     def _place_at(self, index: Tensor) -> Tensor:
         return self.place.gather(1, index[..., None].expand(-1, -1, 2))
@@ -105,10 +111,10 @@ class _Seen:
         columns = [
             torch.log1p(age)[..., None] / 3.0,
             age[..., None] / 200.0,
-            place,
-            (4.0 * (place - self.last[:, None])).clamp(-4.0, 4.0),
+            self.told("absolute", place),
+            self.told("relative", (4.0 * (place - self.last[:, None])).clamp(-4.0, 4.0)),
             torch.log1p(age - self.last_age)[..., None] / 3.0,
-            octaves(place, _NUM_OCTAVES),
+            self.told("absolute", octaves(place, _NUM_OCTAVES)),
         ]
         return torch.cat(columns, dim=-1), is_observed
 
@@ -123,8 +129,8 @@ class _Seen:
             self.last_age / 100.0,
             elapsed / 300.0,
             torch.log1p(elapsed) / 4.0,
-            self.last,
-            velocity.clamp(-2.0, 2.0),
+            self.told("absolute", self.last),
+            self.told("relative", velocity.clamp(-2.0, 2.0)),
             torch.log1p(since) / 3.0,
             torch.log1p(count) / 3.0,
             count / (elapsed + 1.0),
@@ -143,12 +149,14 @@ def _thinned(count: Tensor, keep: int) -> tuple[Tensor, Tensor]:
     return index.minimum(count[:, None] - 1), index < count[:, None]
 
 
-def _goal(context: Context, config: SceneConfig) -> tuple[Tensor, Tensor]:
-    """The known goal [R, 2], zero where there is none, and whether there is one [R, 1]."""
+def _goal(context: Context, config: SceneConfig, last: Tensor) -> tuple[Tensor, Tensor]:
+    """The known goal [R, 2], zero where there is none, and whether there is one [R, 1]; relative ones about `last` [R, 2]."""
     size = len(context.datum_m)
     if context.known_goal_m is None or not config.network.known_goal:
         return torch.zeros(size, 2), torch.zeros(size, 1)
     place = (context.known_goal_m[:, 0] - torch.tensor(config.centre_m)) / config.scale_m
+    if config.network.places == "relative":
+        place = place - last
     is_goal = place.isfinite().all(dim=-1, keepdim=True)
     return torch.where(is_goal, place, 0.0).float(), is_goal.float()
 
@@ -162,7 +170,8 @@ def _trackers(context: Context, config: SceneConfig, last: Tensor) -> tuple[Tens
     place = ((context.tracker_m[:, at] - torch.tensor(config.centre_m)) / config.scale_m).float().transpose(1, 2)
     is_there = place.isfinite().all(dim=-1, keepdim=True)
     offset = torch.where(is_there, place - last[:, None, None], 0.0)
-    now = torch.where(is_there[:, :, 0], place[:, :, 0], 0.0)
+    is_told = is_there[:, :, 0] & (config.network.places != "relative")
+    now = torch.where(is_told, place[:, :, 0], 0.0)
     speed = (offset[:, :, 0] - offset[:, :, 1]).norm(dim=-1, keepdim=True) * config.scale_m / config.unit_step_m
     features = [offset.flatten(2), torch.tanh(8.0 * offset).flatten(2), now, speed / (8.0 * _TRACKER_LAGS[1])]
     return torch.cat(features, dim=-1), is_there[:, :, 0, 0].float()

@@ -7,6 +7,7 @@ amounts to the network reads a map that it has learned.
 
 import math
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
@@ -33,6 +34,8 @@ class SceneNetworkConfig:
     map_cells, map_channels  of the learned map; no channels: no map
     known_goal      the goal that the trackers know of is an input, where one is given
     trackers        the trackers' positions are inputs, where they are given
+    places          detections are told as places on the map ("absolute"), as offsets from the last one ("relative"), or both;
+                    with "relative" nothing but the learned map tells where on the map a track is
     """
 
     width: int = 64
@@ -47,6 +50,7 @@ class SceneNetworkConfig:
     map_channels: int = 8
     known_goal: bool = True
     trackers: bool = True
+    places: Literal["both", "absolute", "relative"] = "both"
 
     def __post_init__(self) -> None:
         if self.map_channels < 0 or min(self.encoder_size, self.code_size, self.max_detections, self.map_cells) < 1:
@@ -159,8 +163,9 @@ class SceneNetwork(nn.Module):
         moved = torch.cos(angle)[:, None, None] * noisy * pieces.span[..., None]
         offset = moved.cumsum(dim=1)
         ends = pieces.last[:, None] + offset
+        place = torch.zeros_like(ends) if self.config.places == "relative" else ends.clamp(-1.5, 1.5)
         times = torch.stack([pieces.start / 100.0, pieces.duration / 10.0, (pieces.start >= 0).to(noisy.dtype)], dim=-1)
-        return torch.cat([noisy, ends.clamp(-1.5, 1.5), (4.0 * offset).clamp(-6.0, 6.0), times, self._read(ends)], dim=-1)
+        return torch.cat([noisy, place, (4.0 * offset).clamp(-6.0, 6.0), times, self._read(ends)], dim=-1)
 
     def level_code(self, angle: Tensor) -> Tensor:
         """The vector that stands for a noise level [R] -> [R, level_size]."""
@@ -169,6 +174,8 @@ class SceneNetwork(nn.Module):
 
     def _read(self, place: Tensor) -> Tensor:
         """The learned map at places [R, P, 2] -> [R, P, channels]."""
+        if not self.config.map_channels:
+            return place.new_zeros(*place.shape[:-1], 0)
         grid = place[None].clamp(-1.0, 1.0)
         found = nn.functional.grid_sample(self.map.float(), grid.float(), align_corners=False, padding_mode="border")
         read: Tensor = found[0].permute(1, 2, 0)

@@ -108,6 +108,32 @@ def test_trackers_are_a_set_and_a_goal_that_is_not_told_is_none() -> None:
     assert not torch.allclose(code(), code(known_goal_m=None), atol=1e-3)
 
 
+def moved(cut: ForecastWindows, by_m: float) -> ForecastWindows:
+    """The same windows elsewhere on the map, with all that belongs to them."""
+    c = cut.context
+    assert c.known_goal_m is not None and c.tracker_m is not None
+    there = dataclasses.replace(c, datum_m=c.datum_m + by_m, known_goal_m=c.known_goal_m + by_m, tracker_m=c.tracker_m + by_m)
+    return dataclasses.replace(cut, context=there)
+
+
+def test_places_are_told_as_they_should_be_and_a_network_may_do_without_a_map() -> None:
+    cut = windows()
+    tracks = {}
+    for places in ("both", "relative", "absolute"):
+        small = dataclasses.replace(SMALL, places=places, map_channels=0)  # type: ignore[arg-type]
+        config = dataclasses.replace(CONFIG, network=small)
+        found = model(config=config)
+        tracks[places] = [found.placed(c.context).sample(c.windows, 2).position_m for c in (cut, moved(cut, 800.0))]
+        inputs = scene_inputs(cut.windows, cut.context, config)
+        is_offset, is_place = (bool(inputs.rows[..., columns].any()) for columns in (slice(4, 6), slice(2, 4)))
+        assert (is_offset, is_place) == (places != "absolute", places != "relative")
+    assert torch.allclose(*tracks["relative"], atol=0.5)  # without a map it does not know where it is
+    assert not torch.allclose(*tracks["absolute"], atol=20.0)
+    with_map = model(config=dataclasses.replace(CONFIG, network=dataclasses.replace(SMALL, places="relative")))
+    here, there = (with_map.placed(c.context).sample(c.windows, 2).position_m for c in (cut, moved(cut, 800.0)))
+    assert not torch.allclose(here, there, atol=0.5)
+
+
 @pytest.mark.parametrize("sampler", ["ddpm", "ddim", "dpmpp", "few"])
 def test_hypotheses_belong_to_their_window(sampler: str) -> None:
     cut = windows()
@@ -226,7 +252,7 @@ def test_the_energy_score_is_the_unbiased_one() -> None:
 
 def test_the_few_steps_of_training_are_those_of_sampling() -> None:
     cut, config = windows(), dataclasses.replace(CONFIG, few_steps=2)
-    free = dataclasses.replace(model(config=config), sampling=SceneSampling(guidance="none"))
+    free = dataclasses.replace(model(config=config), sampling=SceneSampling(starts="independent", guidance="none"))
     free = dataclasses.replace(free, config=dataclasses.replace(config, max_step_m=1e9)).placed(cut.context)
     drawn = free.sample(cut.windows, 2).position_m[:, :, 0]
     inputs = scene_inputs(cut.windows, cut.context, config)
