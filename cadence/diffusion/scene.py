@@ -40,6 +40,8 @@ class SceneSampling:
     sampler     "few": the few steps that the weights were tuned for; "ddpm", "ddim", "dpmpp": any number for weights that
                 were trained by diffusion alone; "auto": few where the weights are tuned, else dpmpp
     num_steps   of ddpm, ddim and dpmpp
+    starts      noise that the hypotheses of a window start from: "spread" over pairs of opposite, orthogonal directions, or
+                "independent"; each alone has the same law
     guidance    away from obstacles while sampling: "clean" on the clean estimate, "paper" (algorithm 1; with ddpm), "none"
     is_repaired lead what still crosses an obstacle around it at the end
     margin_m    distance that is kept from obstacles
@@ -52,6 +54,7 @@ class SceneSampling:
 
     sampler: Literal["auto", "few", "ddpm", "ddim", "dpmpp"] = "auto"
     num_steps: int = 8
+    starts: Literal["spread", "independent"] = "spread"
     guidance: Literal["none", "clean", "paper"] = "clean"
     is_repaired: bool = True
     margin_m: float = 0.0
@@ -129,7 +132,9 @@ class SceneModel:
             clean = clean_from("v", network(flat, angle, pieces, told), flat, torch.tensor(angle)).reshape(noisy.shape)
             return tracks.guided(tracks.limited(clean))
 
-        start = stream.draw((num_hypotheses, self.config.num_pieces, 2))
+        shape = (self.config.num_pieces, 2)
+        is_spread = self.sampling.starts == "spread"
+        start = stream.draw_spread(num_hypotheses, shape) if is_spread else stream.draw((num_hypotheses, *shape))
         sampled = self._solved(denoise, start, stream, tracks)
         positions = future_of(to_track(tracks.limited(sampled).double(), inputs.pieces, self.config), self.config)
         positions = positions + last_m[:, None, None]

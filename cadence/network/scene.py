@@ -141,7 +141,8 @@ class SceneNetwork(nn.Module):
             nn.Linear(size, config.code_size), nn.SiLU(), nn.Linear(config.code_size, config.code_size), nn.SiLU()
         )
         self.last = nn.Linear(config.code_size, config.code_size)
-        self.map = nn.Parameter(0.3 * torch.randn(1, config.map_channels, config.map_cells, config.map_cells))
+        self.map = nn.Parameter(torch.empty(1, config.map_channels, config.map_cells, config.map_cells))
+        nn.init.normal_(self.map, std=0.3)
 
     def encode(self, inputs: SceneInputs) -> Tensor:
         """One vector a window [R, C]; computed once, whatever the number of hypotheses and steps."""
