@@ -25,9 +25,6 @@ from pipeline.windows import UNKNOWN_AGENT, Float64s, Int64s
 GOAL_KEYS = ("known_goal_m", "hideout_known_to_trackers")
 """Keys of a log's Metadata record `mission` that hold [x, y] or a list of them, metres: where the searching side expects it."""
 
-MAP_CELLS = 2428
-"""The paper divides distances by the side of the Prison Escape map, in cells, whatever the map."""
-
 _AIRCRAFT_FACTOR = 3.0
 """A tracker that moves faster than the target by this factor is an aircraft; they come first."""
 _OFF_TRUTH_SHARE = 0.01
@@ -40,7 +37,7 @@ class LogEpisodes:
     """What was read of one log: an episode a target with truth, all with the same obstacles.
 
     names      of the episodes: the log's, with the target's where it has several
-    scale_m    what the paper divides distances by: 2428 cells, or the map's side; NaN where the log states neither
+    scale_m    what the paper divides distances by: the longer side of the map; NaN where the log does not state it
     obstacles  the entries of obstacles.json as JSON text
     """
 
@@ -122,9 +119,7 @@ def _number(record: Mapping[str, str], key: str) -> float | None:
 
 
 def _scale_m(mission: Mapping[str, str]) -> float:
-    cell_m, side_m = _number(mission, "cell_m"), _number(mission, "map_side_m")
-    if cell_m is not None:
-        return MAP_CELLS * cell_m
+    side_m = _number(mission, "map_side_m")
     return np.nan if side_m is None else side_m
 
 

@@ -24,16 +24,13 @@ from pipeline.manifest import hash_file
 from pipeline.obstacles import as_obstacles
 from pipeline.progress import Progress
 from pipeline.provenance import versions
-from pipeline.recorded_logs import MAP_CELLS, Gridding, LogEpisodes, read_log_episodes
+from pipeline.recorded_logs import Gridding, LogEpisodes, read_log_episodes
 
 BLOCK = 500
 """Simulated episodes a file of the cache."""
 
 FORMAT = 1
 """Of the files in the cache."""
-
-UNIT_M = {"prison": 21.0, "narco": 1000.0}
-"""Metres of the unit (a cell, a kilometre) in which the paper counts, by world."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +45,7 @@ class RecordingsConfig:
     step_s         seconds between steps of logs; by default what each log states, or else what its truth has
     max_gap_steps  truth and trackers of logs are interpolated between samples at most so far apart
     tolerance_m    detections of logs count as exact where they are no further than this from the truth
-    scale_m        what distances are divided by; by default 2428 cells of the size that the log or world states
+    scale_m        what distances are divided by; by default the longer side of the map, as logs state it
     extract        where truth, detections and trackers are in the logs
     """
 
@@ -204,7 +201,7 @@ def _digest(key: object) -> str:
 
 @dataclass(frozen=True, eq=False)
 class _World:
-    """A world ready to be simulated: its settings, what gives the episodes of some indices, obstacles, the paper's unit."""
+    """A world ready to be simulated: its settings, what gives the episodes of some indices, obstacles, the map's side."""
 
     config: object
     simulate: Callable[[Sequence[int]], Recordings]
@@ -254,19 +251,21 @@ def _world(config: RecordingsConfig) -> _World:
         from cadence.worlds.prison import PrisonConfig, simulate_prison, simulate_prison_batch
 
         prison = PrisonConfig(set=config.set)
+        terrain = simulate_prison(prison, config.seed, 0).terrain
         return _World(
             prison,
             lambda indices: simulate_prison_batch(prison, config.seed, np.asarray(indices)),
-            as_obstacles(obstacles_as_json(simulate_prison(prison, config.seed, 0).terrain)),
-            MAP_CELLS * UNIT_M["prison"],
+            as_obstacles(obstacles_as_json(terrain)),
+            terrain.side_m,
         )
     from cadence.worlds.narco import NarcoConfig, simulate_narco, simulate_narco_batch
 
     assert config.set != "med"  # refused by the configuration
     narco = NarcoConfig(set=config.set)
+    terrain = simulate_narco(narco, config.seed, 0).terrain
     return _World(
         narco,
         lambda indices: simulate_narco_batch(narco, config.seed, np.asarray(indices)),
-        as_obstacles(obstacles_as_json(simulate_narco(narco, config.seed, 0).terrain)),
-        MAP_CELLS * UNIT_M["narco"],
+        as_obstacles(obstacles_as_json(terrain)),
+        terrain.side_m,
     )
