@@ -1,0 +1,401 @@
+"""What does each input and output of the scene preset bring, and how many training episodes does it need?
+
+Variants of the preset are trained on the rebuilt Prison Escape (all three sets) at one small budget and evaluated on the same
+windows: of simulated episodes with a seed of their own, and of episodes of the original simulator, which none has seen.
+Everything is kept under --work: a killed run goes on where it was, and the page is written from whatever is there.
+
+    python benchmarks/scene_ablations.py --reference ../shared/data/prison_reference --publish docs
+    python benchmarks/scene_ablations.py --only full,no_map --steps 1500 --seeds 0,1
+    python benchmarks/scene_ablations.py --page --publish docs
+"""
+
+import argparse
+import dataclasses
+import functools
+import json
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from cadence.diffusion.scene_frame import SceneConfig
+from cadence.errors import InputError
+from cadence.metrics import Interval
+from cadence.network.scene import SceneNetwork
+from cadence.training.loop import OptimiserConfig
+from cadence.worlds.prison_map import SIDE, prison_map
+from cadence.worlds.recordings import Recordings
+from pipeline.checkpoints import checkpoint_hash
+from pipeline.forecast_leads import averaged, relative_lead
+from pipeline.forecast_scores import HORIZONS, EpisodeScores
+from pipeline.forecast_tables import comparison, line, mean_interval, number, with_interval
+from pipeline.forecasts import ForecastConfig, ForecastRun, forecast_windows
+from pipeline.manifest import write_atomic
+from pipeline.progress import Progress
+from pipeline.recordings import RecordingsConfig, load_recordings, read_recordings
+from pipeline.scene import load_scene
+from pipeline.train import TrainConfig
+from pipeline.train_scene import SceneTraining, train_scene_network
+from pipeline.training_episodes import EpisodePool, EpisodeSource
+
+SETS = ("low", "med", "high")
+KINDS = ("simulated", "original")
+VALIDATION_SEED, NUM_VALIDATION = 1, 100
+MEASURES = {"energy_score": "energy score", "mean_error": "error of the mean", "ade": "ADE", "coverage_90": "90 % coverage"}
+SIDE_M = 2428 * 21.0
+MAP_CELLS = 128
+"""Of the true coverage map; a cell is about as large as the blocks on which fugitives plan their routes."""
+NUM_RESAMPLES = 1000
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One training: what is different in it, in words and in settings."""
+
+    title: str
+    model: SceneConfig = dataclasses.field(default_factory=SceneConfig)
+    num_episodes: int = 4000
+    path_weight: float = 1.0
+    true_map: bool = False
+
+
+def _with(title: str, **network: object) -> Variant:
+    model = SceneConfig()
+    return Variant(title, dataclasses.replace(model, network=dataclasses.replace(model.network, **network)))  # type: ignore[arg-type]
+
+
+_TRUE_MAP = _with("the true coverage map in place of the learned one", map_channels=1, map_cells=MAP_CELLS)
+
+VARIANTS: dict[str, Variant] = {
+    "full": Variant("full"),
+    "no_map": _with("without the learned map", map_channels=0),
+    "true_map": dataclasses.replace(_TRUE_MAP, true_map=True),
+    "no_trackers": _with("without trackers", trackers=False),
+    "no_goal": _with("without the known hideout", known_goal=False),
+    "no_path_weight": Variant("loss of the pieces alone, not of the path", path_weight=0.0),
+    "relative": _with("detections as offsets, places by the learned map alone", places="relative"),
+    "relative_no_map": _with("nothing absolute (offsets, and no map)", places="relative", map_channels=0),
+    "absolute": _with("detections as places on the map alone", places="absolute"),
+}
+CURVE = {"episodes_250": 250, "episodes_1000": 1000, "full": 4000, "episodes_16000": 16000}
+ALL = VARIANTS | {
+    name: Variant(f"{num} training episodes a set", num_episodes=num) for name, num in CURVE.items() if name != "full"
+}
+
+Scores = dict[str, EpisodeScores]
+"""By the name of the set: "simulated low" and so on."""
+
+
+@dataclass(frozen=True)
+class Setup:
+    """What the command line says."""
+
+    work: Path
+    data: Path | None
+    reference: Path | None
+    steps: int
+    batch_size: int
+    num_windows: int
+    num_validation: int
+    progress: Progress
+
+    @property
+    def cache(self) -> Path:
+        """Of episodes."""
+        return self.work / "episodes"
+
+    def result(self, name: str, seed: int) -> Path:
+        """Where the scores of a training are kept."""
+        return self.work / "results" / f"{name}-{self.steps}x{self.batch_size}-s{seed}.json"
+
+
+def training_episodes(name: str, num: int, setup: Setup) -> Recordings:
+    """The first episodes of a set. `InputError` where the folder --data has fewer."""
+    if setup.data is None:
+        return load_recordings(RecordingsConfig(set=name, num_episodes=num), setup.cache, setup.progress).recordings  # type: ignore[arg-type]
+    parts: list[Recordings] = []
+    for path in sorted(setup.data.glob(f"prison_{name}_[0-9]*.npz")):
+        if sum(len(part) for part in parts) < num:
+            parts.append(read_recordings(path)[0])
+    if sum(len(part) for part in parts) < num:
+        raise InputError(f"{setup.data}: fewer than {num} episodes of the set {name}")
+    return Recordings.concatenate(parts).select(slice(0, num))
+
+
+def evaluation_runs(setup: Setup) -> dict[str, ForecastRun]:
+    """Windows of every set; those of the original simulator where --reference says where it is."""
+    sources = {
+        f"simulated {name}": RecordingsConfig(set=name, num_episodes=setup.num_validation, seed=VALIDATION_SEED)  # type: ignore[arg-type]
+        for name in SETS
+    }
+    if setup.reference is not None:
+        for name in SETS:
+            file = setup.reference / f"ref_{name}_val.npz"
+            logs = RecordingsConfig(data=setup.reference / name, pattern="**/*_02[5-9][0-9].mcap")
+            sources[f"original {name}"] = RecordingsConfig(data=file) if file.is_file() else logs
+    config, runs = ForecastConfig(num_windows=setup.num_windows), {}
+    for key, source in sources.items():
+        episodes = load_recordings(source, setup.cache, setup.progress)
+        windows = forecast_windows(episodes.recordings, config)
+        scores = setup.work / "scores"
+        runs[key] = ForecastRun(episodes, windows, config.num_hypotheses, scores, setup.progress, tells_obstacles=False)
+    return runs
+
+
+def train_config(variant: Variant, setup: Setup, seed: int) -> TrainConfig:
+    """The training of a variant; everything that is not varied is the preset's default."""
+    of = functools.partial(RecordingsConfig, data=setup.data, num_episodes=variant.num_episodes)
+    sources = tuple(EpisodeSource(1.0, of(set=name)) for name in SETS)  # type: ignore[arg-type]
+    scene = SceneTraining(variant.model, sources=sources, path_weight=variant.path_weight, num_validation_windows=200)
+    warm_up = min(300, max(1, setup.steps // 5))
+    optimiser = OptimiserConfig(learning_rate=1e-3, num_steps=setup.steps, warm_up_steps=warm_up, bf16=True)
+    every = max(1, setup.steps // 3)
+    return TrainConfig(
+        "scene", seed=seed, batch_size=setup.batch_size, validate_every=every, save_every=min(100, every), optimiser=optimiser,
+        scene=scene,
+    )  # fmt: skip
+
+
+def build(variant: Variant, seed: int) -> SceneNetwork:
+    """The untrained network; the true map is fixed in it."""
+    with torch.random.fork_rng(devices=[]):
+        torch.random.manual_seed(seed)
+        network = variant.model.build()
+    if variant.true_map:
+        with torch.no_grad():
+            network.map.copy_(coverage_cells())
+        network.map.requires_grad_(False)
+    return network
+
+
+def coverage_cells() -> torch.Tensor:
+    """The coverage as means over cells [1, 1, MAP_CELLS (y), MAP_CELLS (x)], about zero with a deviation of about one."""
+    edges = np.round(np.linspace(0, SIDE, MAP_CELLS + 1)).astype(int)
+    total = np.add.reduceat(np.add.reduceat(prison_map().coverage, edges[:-1], axis=0), edges[:-1], axis=1)
+    mean = torch.from_numpy(total / np.outer(np.diff(edges), np.diff(edges))).T.float()
+    return ((mean - mean.mean()) / mean.std())[None, None]
+
+
+def run_variant(
+    name: str, seed: int, setup: Setup, load: Callable[[int], EpisodePool], runs: Mapping[str, ForecastRun]
+) -> None:
+    """Train and evaluate, as far as that is not done."""
+    path = setup.result(name, seed)
+    if path.is_file():
+        return
+    variant, out = ALL[name], setup.work / "trainings" / path.stem
+    is_fresh, begin = not (out / "state.safetensors").is_file(), time.process_time()
+    simulated = [run.episodes.recordings for key, run in runs.items() if key.startswith("simulated")]
+    held_out = EpisodePool(tuple(simulated), (1.0,) * len(simulated))
+    config = train_config(variant, setup, seed)
+    result = train_scene_network(out, config, build(variant, seed), load(variant.num_episodes), held_out, setup.progress)
+    seconds = time.process_time() - begin
+    weights = result.outputs[0]
+    estimate = functools.partial(load_scene, weights)
+    scores = {key: run.score(f"{name}-{key}", estimate, [checkpoint_hash(weights)]).as_json() for key, run in runs.items()}
+    record = {"variant": name, "seed": seed, "steps": setup.steps, "cpu_seconds": seconds if is_fresh else None}
+    write_atomic(path, json.dumps({**record, "validation_loss": result.summary["validation_loss"], "scores": scores}) + "\n")
+
+
+def found_scores(setup: Setup, seeds: Sequence[int]) -> tuple[dict[str, Scores], dict[str, int]]:
+    """Scores averaged over the trainings that are done, and the number of these, by variant."""
+    results, counts = {}, {}
+    for name in ALL:
+        paths = [path for path in (setup.result(name, seed) for seed in seeds) if path.is_file()]
+        records = [json.loads(path.read_text(encoding="utf-8"))["scores"] for path in paths]
+        if records:
+            keys = [key for key in records[0] if all(key in record for record in records)]
+            results[name] = {key: averaged([EpisodeScores.from_json(record[key]) for record in records]) for key in keys}
+            counts[name] = len(records)
+    return results, counts
+
+
+def cost(own: Scores, full: Scores, kind: str, measure: str) -> Interval | None:
+    """How much worse than the full variant, in per cent of its score: mean over the sets of a kind and the horizons."""
+    keys = [key for key in own if key.startswith(kind) and key in full]
+    if not keys:
+        return None
+    lead = relative_lead(
+        [own[key] for key in keys], [[full[key] for key in keys]], measure, measure, HORIZONS, 0, NUM_RESAMPLES
+    )
+    return dataclasses.replace(lead, value=-100 * lead.value, low=-100 * lead.high, high=-100 * lead.low)
+
+
+def summary_table(results: Mapping[str, Scores], names: Sequence[str]) -> Iterator[str]:
+    """A row a variant: what it costs, by measure and kind of episodes, and the mean 90 % coverage."""
+    heads = [f"{MEASURES[m]}, {kind}, %" for m in ("energy_score", "mean_error", "ade") for kind in KINDS]
+    heads += [f"90 % coverage, {kind}, %" for kind in KINDS]
+    yield line(["variant", *heads])
+    yield line(["---"] * (1 + len(heads)))
+    for name in names:
+        own = results[name]
+        costs = [cost(own, results["full"], kind, m) for m in ("energy_score", "mean_error", "ade") for kind in KINDS]
+        cells = ["0" if name == "full" else "–" if c is None else with_interval(c.value, c.low, c.high, 2) for c in costs]
+        for kind in KINDS:
+            values = [own[key].mean("coverage_90").mean() for key in own if key.startswith(kind)]
+            cells.append(number(100 * float(np.mean(values))) if values else "–")
+        yield line([ALL[name].title, *cells])
+    yield ""
+
+
+def set_tables(key: str, results: Mapping[str, Scores]) -> Iterator[str]:
+    """All measures at all horizons on one set, each with its paired difference from the full variant."""
+    yield from (f"## {key}", "")
+    for measure, title in MEASURES.items():
+        yield from (f"### {title}: {key}", "", line(["variant", "0", "30", "60", "90", "120 min"]), line(["---"] * 6))
+        for name, own in results.items():
+            if key in own:
+                yield line([ALL[name].title, *_cells(own[key], None if name == "full" else results["full"].get(key), measure)])
+        yield ""
+
+
+def _cells(own: EpisodeScores, full: EpisodeScores | None, measure: str) -> Iterator[str]:
+    unit = 0.01 if measure.startswith("coverage") else SIDE_M
+    for step, value in zip(HORIZONS, own.mean(measure), strict=True):
+        text = number(value / unit)
+        if full is not None:
+            both = {"own": own, "full": full}
+            found = comparison("own", "full", step, both, 0, NUM_RESAMPLES, measure)
+            triple = (found.difference_m, found.difference_low_m, found.difference_high_m)
+            text += f" ({with_interval(*(part / unit for part in triple), 2)})"
+        yield text
+
+
+def curve_points(results: Mapping[str, Scores]) -> dict[str, list[tuple[int, Interval]]]:
+    """By set: training episodes, and the energy score's mean over the horizons, over the map side."""
+    points: dict[str, list[tuple[int, Interval]]] = {}
+    for name, num in CURVE.items():
+        for key, scores in results.get(name, {}).items():
+            found = mean_interval(scores.measure("energy_score").mean(axis=1) / SIDE_M, scores, 0, NUM_RESAMPLES)
+            points.setdefault(key, []).append((num, found))
+    return points
+
+
+def curve_table(results: Mapping[str, Scores]) -> Iterator[str]:
+    """The curve's points, and its costs against 4 000 episodes."""
+    points = curve_points(results)
+    yield line(["training episodes a set", *points, *(f"against 4 000, {kind}, %" for kind in KINDS)])
+    yield line(["---"] * (1 + len(points) + len(KINDS)))
+    for name, num in CURVE.items():
+        if name in results:
+            at = [dict(found).get(num) for found in points.values()]
+            cells = ["–" if p is None else with_interval(p.value, p.low, p.high) for p in at]
+            costs = [cost(results[name], results["full"], kind, "energy_score") for kind in KINDS]
+            cells += ["0" if name == "full" else "–" if c is None else with_interval(c.value, c.low, c.high, 2) for c in costs]
+            yield line([f"{num:,}".replace(",", " "), *cells])
+    yield ""
+
+
+def draw_curve(results: Mapping[str, Scores], path: Path) -> None:
+    """The curve as a picture."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7, 4.2), layout="constrained")
+    axes = figure.subplots()
+    for key, found in curve_points(results).items():
+        kind, name = key.split()
+        value = np.array([[p.value, p.value - p.low, p.high - p.value] for _, p in found])
+        style = {"color": f"C{SETS.index(name)}", "linestyle": "-" if kind == "simulated" else "--", "marker": "o"}
+        axes.errorbar([num for num, _ in found], value[:, 0], value[:, 1:].T, label=key, capsize=3, **style)
+    axes.set(xscale="log", xlabel="training episodes a set (simulated)", ylabel="energy score / map side, mean over horizons")
+    axes.set_xticks(list(CURVE.values()), [str(num) for num in CURVE.values()], minor=False)
+    axes.legend(fontsize=8)
+    axes.grid(alpha=0.3)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=110)
+
+
+def page(setup: Setup, results: Mapping[str, Scores], counts: Mapping[str, int], with_picture: bool) -> str:
+    """The page."""
+    missing = [variant.title for name, variant in ALL.items() if name not in results]
+    picture = ["![energy score against the number of training episodes](../images/scene_episodes.png)", ""]
+    windows = min((int(scores.count.sum()) for found in results.values() for scores in found.values()), default=0)
+    lines = [
+        "# What the scene preset's parts are worth", "",
+        f"Written by `benchmarks/scene_ablations.py` (--steps {setup.steps} --batch {setup.batch_size}); trainings a "
+        f"variant: {' to '.join(str(num) for num in sorted({min(counts.values()), max(counts.values())}))}. Everything but what a row names is as in `full`: all "
+        f"inputs, 4 000 simulated episodes of each of the sets low, med and high of Prison Escape, {setup.steps} steps of "
+        f"{setup.batch_size} windows. The budget is small: it compares variants; none is as good as the shipped checkpoint.",
+        "",
+        f"{windows} windows a set, 30 hypotheses, default sampler without obstacles, the known hideout and the trackers told. "
+        "*simulated*: episodes with a seed of their own; *original*: the authors' simulator, which no variant was trained on. "
+        "Brackets: 95 % bootstrap over episodes, paired with `full`; the spread between trainings is not in them.", "",
+        "## Inputs and outputs", "",
+        "How much worse than `full`, mean over sets and horizons (positive: the part is worth something):", "",
+        *summary_table(results, [name for name in VARIANTS if name in results]),
+        "## Training episodes", "", "Energy score over the map side, mean over horizons:", "",
+        *(picture if with_picture else []),
+        *curve_table(results),
+        "Draws of the trajectory library as a further input were not tried: windows would have to be matched against the "
+        "library in every training step.", "",
+    ]  # fmt: skip
+    lines += [f"Not run yet: {'; '.join(missing)}.", ""] if missing else []
+    lines += ["Below: values over the map side (coverage in per cent), in round brackets the difference from `full`.", ""]
+    for kind in KINDS:
+        for name in SETS:
+            if any(f"{kind} {name}" in found for found in results.values()):
+                lines += set_tables(f"{kind} {name}", results)
+    return "\n".join(lines).rstrip() + "\n"
+
+
+def publish(setup: Setup, seeds: Sequence[int], docs: Path | None) -> None:
+    """Write the page from what is there."""
+    results, counts = found_scores(setup, seeds)
+    if "full" not in results:
+        setup.progress.note("no page yet: the full variant is not done")
+        return
+    has_curve = sum(name in results for name in CURVE) > 1
+    text = page(setup, results, counts, has_curve)
+    if docs is None:
+        print(text)
+        return
+    write_atomic(docs / "benchmarks" / "scene_ablations.md", text)
+    if has_curve:
+        draw_curve(results, docs / "images" / "scene_episodes.png")
+
+
+def main() -> int:
+    """Run what is not done, variant by variant, and write the page after each."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--work", type=Path, default=Path("runs/ablations"))
+    parser.add_argument("--data", type=Path, help="folder of prison_SET_NNN.npz to train on; without it they are simulated")
+    parser.add_argument("--reference", type=Path, help="logs of the original simulator (low, med, high), or ref_SET_val.npz")
+    parser.add_argument("--publish", type=Path, help="folder docs; without it the page is printed")
+    parser.add_argument("--only", default=",".join(ALL), help="variants, by name")
+    parser.add_argument("--steps", type=int, default=1500)
+    parser.add_argument("--batch", type=int, default=256)
+    parser.add_argument("--seeds", default="0", help="of training")
+    parser.add_argument("--windows", type=int, default=500, help="of each set")
+    parser.add_argument("--validation", type=int, default=NUM_VALIDATION, help="simulated episodes a set to evaluate on")
+    parser.add_argument("--page", action="store_true", help="only write the page")
+    args = parser.parse_args()
+    unknown = [name for name in args.only.split(",") if name not in ALL]
+    if unknown:
+        parser.error(f"variant {unknown[0]!r} is not known; known: {', '.join(ALL)}")
+    setup = Setup(args.work, args.data, args.reference, args.steps, args.batch, args.windows, args.validation, Progress())
+    seeds = [int(text) for text in args.seeds.split(",")]
+    torch.set_num_threads(1)
+
+    @functools.lru_cache(maxsize=1)
+    def load(num: int) -> EpisodePool:
+        return EpisodePool(tuple(training_episodes(name, num, setup) for name in SETS), (1.0,) * len(SETS))
+
+    runs = {} if args.page else evaluation_runs(setup)
+    for seed in [] if args.page else seeds:
+        for name in args.only.split(","):
+            try:
+                run_variant(name, seed, setup, load, runs)
+            except InputError as error:
+                setup.progress.warn(f"{name} left out: {error}")
+            publish(setup, seeds, args.publish)
+    if args.page:
+        publish(setup, seeds, args.publish)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
