@@ -312,12 +312,13 @@ def draw_curve(results: Mapping[str, Scores], path: Path) -> None:
 def page(setup: Setup, results: Mapping[str, Scores], counts: Mapping[str, int], with_picture: bool) -> str:
     """The page."""
     missing = [variant.title for name, variant in ALL.items() if name not in results]
+    trainings = " to ".join(str(num) for num in sorted({min(counts.values()), max(counts.values())}))
     picture = ["![energy score against the number of training episodes](../images/scene_episodes.png)", ""]
     windows = min((int(scores.count.sum()) for found in results.values() for scores in found.values()), default=0)
     lines = [
         "# What the scene preset's parts are worth", "",
         f"Written by `benchmarks/scene_ablations.py` (--steps {setup.steps} --batch {setup.batch_size}); trainings a "
-        f"variant: {' to '.join(str(num) for num in sorted({min(counts.values()), max(counts.values())}))}. Everything but what a row names is as in `full`: all "
+        f"variant: {trainings}. Everything but what a row names is as in `full`: all "
         f"inputs, 4 000 simulated episodes of each of the sets low, med and high of Prison Escape, {setup.steps} steps of "
         f"{setup.batch_size} windows. The budget is small: it compares variants; none is as good as the shipped checkpoint.",
         "",
