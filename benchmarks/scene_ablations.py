@@ -254,14 +254,16 @@ def set_tables(key: str, results: Mapping[str, Scores]) -> Iterator[str]:
 
 
 def _cells(own: EpisodeScores, full: EpisodeScores | None, measure: str) -> Iterator[str]:
-    unit = 0.01 if measure.startswith("coverage") else SIDE_M
+    """Values over the map side with the paired difference in per cent; coverage and its difference in per cent."""
+    is_share = measure.startswith("coverage")
     for step, value in zip(HORIZONS, own.mean(measure), strict=True):
-        text = number(value / unit)
+        text = number(100 * value if is_share else value / SIDE_M)
         if full is not None:
-            both = {"own": own, "full": full}
-            found = comparison("own", "full", step, both, 0, NUM_RESAMPLES, measure)
-            triple = (found.difference_m, found.difference_low_m, found.difference_high_m)
-            text += f" ({with_interval(*(part / unit for part in triple), 2)})"
+            found = comparison("own", "full", step, {"own": own, "full": full}, 0, NUM_RESAMPLES, measure)
+            triple = np.array([found.ratio, found.ratio_low, found.ratio_high]) - 1.0
+            if is_share:
+                triple = np.array([found.difference_m, found.difference_low_m, found.difference_high_m])
+            text += " ({:+.1f} [{:+.1f}, {:+.1f}])".format(*100 * triple)
         yield text
 
 
@@ -291,17 +293,28 @@ def curve_table(results: Mapping[str, Scores]) -> Iterator[str]:
 
 
 def draw_curve(results: Mapping[str, Scores], path: Path) -> None:
-    """The curve as a picture."""
+    """The curve against 4 000 episodes as a picture: every set, and the mean of a kind with its paired interval."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(7, 4.2), layout="constrained")
     axes = figure.subplots()
-    for key, found in curve_points(results).items():
-        kind, name = key.split()
-        value = np.array([[p.value, p.value - p.low, p.high - p.value] for _, p in found])
-        style = {"color": f"C{SETS.index(name)}", "linestyle": "-" if kind == "simulated" else "--", "marker": "o"}
-        axes.errorbar([num for num, _ in found], value[:, 0], value[:, 1:].T, label=key, capsize=3, **style)
-    axes.set(xscale="log", xlabel="training episodes a set (simulated)", ylabel="energy score / map side, mean over horizons")
+    names = [name for name in CURVE if name in results]
+    counts = [CURVE[name] for name in names]
+    for color, kind in enumerate(KINDS):
+        for dash, of in zip(("-", "--", ":"), SETS, strict=True):
+            key = f"{kind} {of}"
+            if all(key in results[name] for name in names):
+                values = np.array([results[name][key].mean("energy_score").mean() for name in names])
+                change = 100 * (values / values[names.index("full")] - 1)
+                axes.plot(counts, change, color=f"C{color}", linestyle=dash, linewidth=0.8, alpha=0.7, label=key)
+        costs = [cost(results[name], results["full"], kind, "energy_score") for name in names]
+        if all(item is not None for item in costs):
+            value = np.array([[item.value, item.value - item.low, item.high - item.value] for item in costs if item])
+            bars = np.maximum(value[:, 1:].T, 0.0)
+            axes.errorbar(
+                counts, value[:, 0], bars, color=f"C{color}", marker="o", capsize=3, label=f"{kind}, mean of the sets"
+            )
+    axes.set(xscale="log", xlabel="training episodes a set (simulated)", ylabel="energy score against 4 000 episodes, %")
     axes.set_xticks(list(CURVE.values()), [str(num) for num in CURVE.values()], minor=False)
     axes.legend(fontsize=8)
     axes.grid(alpha=0.3)
@@ -335,7 +348,10 @@ def page(setup: Setup, results: Mapping[str, Scores], counts: Mapping[str, int],
         "library in every training step.", "",
     ]  # fmt: skip
     lines += [f"Not run yet: {'; '.join(missing)}.", ""] if missing else []
-    lines += ["Below: values over the map side (coverage in per cent), in round brackets the difference from `full`.", ""]
+    lines += [
+        "Below: values over the map side, in round brackets the difference from `full` in per cent of it; coverage and its "
+        "difference in per cent.", "",
+    ]  # fmt: skip
     for kind in KINDS:
         for name in SETS:
             if any(f"{kind} {name}" in found for found in results.values()):
