@@ -40,12 +40,11 @@ class SceneSampling:
     sampler     "few": the few steps that the weights were tuned for; "ddpm", "ddim", "dpmpp": any number for weights that
                 were trained by diffusion alone; "auto": few where the weights are tuned, else dpmpp
     num_steps   of ddpm, ddim and dpmpp
-    starts      noise that the hypotheses of a window start from: "spread" over pairs of opposite, orthogonal directions, or
-                "independent"; each alone has the same law
     guidance    away from obstacles while sampling: "clean" on the clean estimate, "paper" (algorithm 1; with ddpm), "none"
     is_repaired lead what still crosses an obstacle around it at the end
     margin_m    distance that is kept from obstacles
-    learning_rate, iterations  of the paper's guidance
+    learning_rate, iterations, step_weight  of the paper's guidance; the last is the weight of the mean step length, which is
+                smallest for targets that do not move
     precision   of the network's layers; "bfloat16" is quicker on processors that have it, and rounds a track by about a
                 hundredth of a step
     chunk       tracks computed at once
@@ -54,12 +53,12 @@ class SceneSampling:
 
     sampler: Literal["auto", "few", "ddpm", "ddim", "dpmpp"] = "auto"
     num_steps: int = 8
-    starts: Literal["spread", "independent"] = "spread"
     guidance: Literal["none", "clean", "paper"] = "clean"
     is_repaired: bool = True
     margin_m: float = 0.0
     learning_rate: float = 1e-2
     iterations: int = 8
+    step_weight: float = 50.0
     precision: Literal["float32", "bfloat16"] = "float32"
     chunk: int = 1024
     encode_each_step: bool = False
@@ -67,8 +66,8 @@ class SceneSampling:
     def __post_init__(self) -> None:
         if self.guidance == "paper" and self.sampler != "ddpm":
             raise ValueError(f"guidance 'paper' moves the mean of a ddpm step; sampler is {self.sampler!r}")
-        if min(self.num_steps, self.chunk, self.iterations) < 1 or self.margin_m < 0:
-            raise ValueError("num_steps, chunk and iterations must be at least 1, margin_m not negative")
+        if min(self.num_steps, self.chunk, self.iterations) < 1 or min(self.margin_m, self.step_weight) < 0:
+            raise ValueError("num_steps, chunk and iterations must be at least 1, margin_m and step_weight not negative")
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,9 +131,7 @@ class SceneModel:
             clean = clean_from("v", network(flat, angle, pieces, told), flat, torch.tensor(angle)).reshape(noisy.shape)
             return tracks.guided(tracks.limited(clean))
 
-        shape = (self.config.num_pieces, 2)
-        is_spread = self.sampling.starts == "spread"
-        start = stream.draw_spread(num_hypotheses, shape) if is_spread else stream.draw((num_hypotheses, *shape))
+        start = stream.draw((num_hypotheses, self.config.num_pieces, 2))
         sampled = self._solved(denoise, start, stream, tracks)
         positions = future_of(to_track(tracks.limited(sampled).double(), inputs.pieces, self.config), self.config)
         positions = positions + last_m[:, None, None]
@@ -189,7 +186,8 @@ class _Tracks:
 
     def paper_guided(self, mean: Tensor, angle: float) -> Tensor:
         """Algorithm 1 on the mean of a DDPM step."""
-        cost = PaperCost(self.obstacles, unit_m=self.config.scale_m, offset_m=self.offset_m)
+        weight = self.sampling.step_weight
+        cost = PaperCost(self.obstacles, unit_m=self.config.scale_m, step_weight=weight, offset_m=self.offset_m)
 
         def cost_of(displacement: Tensor) -> Tensor:
             return cost.cost(to_track(displacement, self.pieces, self.config) + self.last_m)

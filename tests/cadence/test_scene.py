@@ -252,7 +252,7 @@ def test_the_energy_score_is_the_unbiased_one() -> None:
 
 def test_the_few_steps_of_training_are_those_of_sampling() -> None:
     cut, config = windows(), dataclasses.replace(CONFIG, few_steps=2)
-    free = dataclasses.replace(model(config=config), sampling=SceneSampling(starts="independent", guidance="none"))
+    free = dataclasses.replace(model(config=config), sampling=SceneSampling(guidance="none"))
     free = dataclasses.replace(free, config=dataclasses.replace(config, max_step_m=1e9)).placed(cut.context)
     drawn = free.sample(cut.windows, 2).position_m[:, :, 0]
     inputs = scene_inputs(cut.windows, cut.context, config)
