@@ -131,7 +131,8 @@ def energy_loss(
     joint = _energy_score(track.flatten(2)[:, :, None], truth.flatten(1)[:, None]).mean() / clean.shape[1] ** 0.5
     is_real = (inputs.pieces.span > 0).float()
     local = (_energy_score(found, clean) * is_real).sum() / is_real.sum()
-    return at_knots + weights[0] * joint + weights[1] * _LOCAL_SCALE * local
+    loss: Tensor = at_knots + weights[0] * joint + weights[1] * _LOCAL_SCALE * local
+    return loss
 
 
 def _energy_score(found: Tensor, truth: Tensor) -> Tensor:
