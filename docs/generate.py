@@ -68,10 +68,11 @@ def cli_page() -> str:
 def configuration_page() -> str:
     """docs/configuration.md: a table of keys for every stage and for every table inside it."""
     parts = [CONFIGURATION_INTRODUCTION]
+    described = {stage_config_class(table): f"[{table}]" for table in TABLES}
     for table in TABLES:
         cls = stage_config_class(table)
         parts.append(f"## [{table}]\n")
-        parts += _tables_of(cls, table)
+        parts += _tables_of(cls, table, described)
     parts += ["## Presets\n", PRESETS_INTRODUCTION, "| preset | schemas (in any spelling) |", "|---|---|"]
     for name, preset in sorted(PRESETS.items()):
         parts.append(f"| `{name}` | {', '.join(f'`{schema}`' for schema in preset.schemas)} |")
@@ -119,7 +120,8 @@ def _help(command: list[str]) -> str:
     return f"```text\n{text}\n```\n"
 
 
-def _tables_of(cls: type[Any], name: str) -> list[str]:
+def _tables_of(cls: type[Any], name: str, described: dict[type[Any], str]) -> list[str]:
+    """A table's keys and the tables inside it; what was `described` before, under the name kept there, is referred to."""
     summary = (inspect.getdoc(cls) or "").splitlines()[0]
     parts = [f"{summary}\n", _rows(cls)]
     hints, texts = typing.get_type_hints(cls), meanings(cls)
@@ -135,7 +137,11 @@ def _tables_of(cls: type[Any], name: str) -> list[str]:
         leaf = titles[0].strip("[]").rpartition(".")[2]
         if texts.get(leaf):
             parts.append(f"{texts[leaf][0].upper()}{texts[leaf][1:]}.\n")
-        parts += _tables_of(nested, titles[0].strip("[]"))
+        if nested in described:
+            parts.append(f"The same keys as {described[nested]}.\n")
+        else:
+            described[nested] = titles[0]
+            parts += _tables_of(nested, titles[0].strip("[]"), described)
     return parts
 
 
