@@ -190,7 +190,8 @@ def _learned(name: str, case: Case, paths: Sequence[Path], run: ForecastRun, set
     for path in paths:
         info = read_info(path)
         is_reader = reads_goal(info.network)
-        if (goal and not is_reader) or (not goal and is_reader and name == "paper"):  # the paper's network cannot do without
+        is_bound = name == "paper" and is_reader and not info.network.get("optional_goal", False)
+        if (goal and not is_reader) or (not goal and is_bound):
             return None
         label = f"{name}-{case.world}-{case.set}"
         build = functools.partial(load_forecaster, str(path), samplings)
