@@ -40,20 +40,21 @@ class SceneSampling:
     sampler     "few": the few steps that the weights were tuned for; "ddpm", "ddim", "dpmpp": any number for weights that
                 were trained by diffusion alone; "auto": few where the weights are tuned, else dpmpp
     num_steps   of ddpm, ddim and dpmpp
-    guidance    away from obstacles while sampling: "clean" on the clean estimate, "paper" (algorithm 1; with ddpm), "none"
-    is_repaired lead what still crosses an obstacle around it at the end
+    guidance    away from obstacles while sampling: "none", "clean" on the clean estimate, "paper" (algorithm 1; with ddpm).
+                "none" with repair keeps out as well, and changes tracks least: pushed while they are still uncertain, they
+                take another way altogether (docs/benchmarks/guidance.md)
+    is_repaired lead what crosses an obstacle around it at the end
     margin_m    distance that is kept from obstacles
     learning_rate, iterations, step_weight  of the paper's guidance; the last is the weight of the mean step length, which is
                 smallest for targets that do not move
-    precision   of the network's layers; "bfloat16" is quicker on processors that have it, and rounds a track by about a
-                hundredth of a step
+    precision   of the network's layers; "bfloat16" is quicker on processors that have it, at a rounding that no score shows
     chunk       tracks computed at once
     encode_each_step  read the detections again for every hypothesis and step, as the authors' code does: for benchmarks only
     """
 
     sampler: Literal["auto", "few", "ddpm", "ddim", "dpmpp"] = "auto"
     num_steps: int = 8
-    guidance: Literal["none", "clean", "paper"] = "clean"
+    guidance: Literal["none", "clean", "paper"] = "none"
     is_repaired: bool = True
     margin_m: float = 0.0
     learning_rate: float = 1e-2

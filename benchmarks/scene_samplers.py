@@ -1,0 +1,382 @@
+"""Which sampler draws forecasts fastest without making them worse, and how far is it from the paper's procedure?
+
+Every variant draws the same number of hypotheses for the same windows of the prison world with one network. Scores are kept in
+blocks of windows in the work folder: a killed run goes on where it was, and more windows can be added. Speeds are ratios of
+processor times on one thread, all variants one after the other in every round, the order reversed in every other round.
+
+    python benchmarks/scene_samplers.py --publish docs/benchmarks
+"""
+
+import argparse
+import dataclasses
+import hashlib
+import statistics
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from cadence.constraints.obstacles import Obstacles
+from cadence.diffusion.scene import SceneModel, SceneSampling
+from cadence.errors import CadenceError
+from cadence.metrics import Interval, bootstrap_ratio
+from cadence.types import HypothesisSet
+from cadence.worlds import prison_map
+from cadence.worlds.recordings import ForecastWindows, Recordings, choose_windows, cut_windows
+from pipeline.checkpoints import checkpoint_hash, find_checkpoint
+from pipeline.forecast_scores import HORIZONS, EpisodeScores, score_forecasts, step_quantiles
+from pipeline.manifest import write_atomic
+from pipeline.progress import Progress
+from pipeline.provenance import versions
+from pipeline.recordings import RecordingsConfig, load_recordings
+from pipeline.scene import load_scene
+
+DATA = Path(__file__).resolve().parents[1].parent / "shared" / "data" / "prison_reference"
+SETS = ("low", "med", "high")
+VALIDATION = "*_02[5-9]?.mcap"
+"""Episodes 250 to 299 of each set."""
+WORK = Path("out/benchmarks/scene")
+STEPS = (5, 8, 15, 25)
+LEVELS = (0.05, 0.25, 0.5, 0.75, 0.95, 0.99)
+SIDE_M = prison_map.SIDE * prison_map.CELL_M
+CLAIM, TOLERANCE = 20.0, 1.02
+
+PLAIN = SceneSampling(guidance="none", is_repaired=False)
+PAPER = SceneSampling(sampler="ddpm", num_steps=100, guidance="paper", is_repaired=False)
+
+
+@dataclass(frozen=True)
+class Variant:
+    """A row: how it samples, for its scores and for its speed, and whether with the tuned weights."""
+
+    name: str
+    sampling: SceneSampling
+    timed: SceneSampling | None = None
+    is_tuned: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """Windows in blocks, by name, and what they are in."""
+
+    blocks: dict[str, ForecastWindows]
+    obstacles: Obstacles
+    num_hypotheses: int
+    work: Path
+
+    @property
+    def num_windows(self) -> int:
+        """In all blocks."""
+        return sum(len(block) for block in self.blocks.values())
+
+
+DDPM = "DDPM, 100 steps"
+THE_PAPERS = "**the paper's procedure**"
+DEFAULT = "**default**, led around the mountain"
+
+
+def variants(has_tuned: bool) -> list[Variant]:
+    """The paper's procedure first, the default last."""
+    rows = [Variant(THE_PAPERS, PAPER, dataclasses.replace(PAPER, encode_each_step=True))]
+    rows.append(Variant(DDPM, dataclasses.replace(PLAIN, sampler="ddpm", num_steps=100)))
+    rows += [Variant(f"DDIM, {n} steps", dataclasses.replace(PLAIN, sampler="ddim", num_steps=n)) for n in STEPS]
+    rows += [Variant(f"DPM-Solver++, {n} steps", dataclasses.replace(PLAIN, sampler="dpmpp", num_steps=n)) for n in STEPS]
+    rounded = dataclasses.replace(PLAIN, precision="bfloat16")
+    rows.append(Variant("default in bfloat16", rounded, is_tuned=has_tuned))
+    if has_tuned:
+        rows.append(Variant("few steps, tuned weights", dataclasses.replace(PLAIN, sampler="few"), is_tuned=True))
+    rows.append(Variant(DEFAULT, SceneSampling(), is_tuned=has_tuned))
+    return rows
+
+
+def mountain() -> Obstacles:
+    """The prison world's only one: its keep-out circle, by which the paper counts collisions."""
+    x, y = prison_map.MOUNTAIN
+    circle = [x * prison_map.CELL_M, y * prison_map.CELL_M, prison_map.KEEP_OUT * prison_map.CELL_M]
+    return Obstacles(torch.tensor([circle], dtype=torch.float64))
+
+
+def load_sets(data: Sequence[Path], work: Path) -> dict[str, Recordings]:
+    """Episodes by the name of their folder or file."""
+    found = {}
+    for path in data:
+        config = RecordingsConfig(data=path, pattern=VALIDATION)
+        found[path.stem] = load_recordings(config, work / "episodes", Progress()).recordings
+    return found
+
+
+def cut_blocks(sets: dict[str, Recordings], num_windows: int, size: int, seed: int) -> dict[str, ForecastWindows]:
+    """Windows at random, as many of every set, in blocks of `size`; more windows leave the first ones as they are."""
+    blocks = {}
+    for number, (name, recordings) in enumerate(sets.items()):
+        for begin in range(0, -(-num_windows // len(sets)), size):
+            rng = np.random.default_rng([seed, number, begin])
+            blocks[f"{name}-{begin:05d}"] = block_of(recordings, number, *choose_windows(recordings, size, rng), seed)
+    return dict(sorted(blocks.items(), key=lambda item: item[0].rsplit("-", 1)[1]))
+
+
+def block_of(
+    recordings: Recordings, number: int, episode: np.typing.NDArray[np.int64], step: np.typing.NDArray[np.int64], seed: int
+) -> ForecastWindows:
+    """Windows of one set, whose episodes are numbered apart from those of other sets."""
+    cut = cut_windows(recordings, episode, step, seed=seed)
+    return dataclasses.replace(cut, episode=cut.episode + 10_000 * number)
+
+
+def sampled(model: SceneModel, block: ForecastWindows, task: Task) -> tuple[HypothesisSet, float]:
+    """Hypotheses of a block and the processor time they took."""
+    begin = time.process_time()
+    drawn = model.placed(block.context, task.obstacles).sample(block.windows, task.num_hypotheses)
+    return drawn, time.process_time() - begin
+
+
+def score(block: ForecastWindows, drawn: HypothesisSet, task: Task, seconds: float) -> EpisodeScores:
+    """Scores of one block."""
+    return score_forecasts(drawn, block.truth_m, block.episode, block.context.datum_m, task.obstacles, seconds=seconds)
+
+
+def score_all(task: Task, models: dict[str, SceneModel]) -> dict[str, EpisodeScores]:
+    """Every model on every block; what is in the work folder is not done again."""
+    parts: dict[str, list[EpisodeScores]] = {name: [] for name in models}
+    with Progress().bar(len(task.blocks) * len(models), "score", "block") as bar:
+        for number, (key, block) in enumerate(task.blocks.items()):
+            names = list(models) if number % 2 == 0 else list(models)[::-1]
+            for name in names:
+                parts[name].append(_kept_score(models[name], key, block, task))
+                bar.update()
+    return {name: EpisodeScores.add(rows) for name, rows in parts.items()}
+
+
+def _kept_score(model: SceneModel, key: str, block: ForecastWindows, task: Task) -> EpisodeScores:
+    what = repr((model.sampling, task.num_hypotheses, block.windows.seeds.tolist(), _digest(model)))
+    path = task.work / f"{key}-{hashlib.sha256(what.encode()).hexdigest()[:24]}.json"
+    if path.is_file():
+        return EpisodeScores.from_json(path.read_text(encoding="utf-8"))
+    drawn, seconds = sampled(model, block, task)
+    found = score(block, drawn, task, seconds)
+    write_atomic(path, found.as_json())
+    return found
+
+
+def _digest(model: SceneModel) -> str:
+    total = hashlib.sha256(repr(model.config).encode())
+    for value in model.network.state_dict().values():
+        total.update(value.numpy().tobytes())
+    return total.hexdigest()
+
+
+def truth_scores(task: Task) -> EpisodeScores:
+    """The true tracks as if they were the only hypothesis: their steps, and where they are."""
+    parts = []
+    for block in task.blocks.values():
+        size = len(block)
+        drawn = HypothesisSet(block.truth_m[:, None], torch.ones(size, 1, dtype=torch.float64), (("ok",),) * size)
+        parts.append(score(block, drawn, task, 0.0))
+    return EpisodeScores.add(parts)
+
+
+def time_all(task: Task, models: dict[str, SceneModel], num_windows: int, rounds: int) -> dict[str, list[float]]:
+    """Processor seconds of every model on the first windows of the first blocks, round by round."""
+    keys = list(task.blocks)[: min(len(task.blocks), len(SETS))]
+    some = [task.blocks[key][: max(1, num_windows // len(keys))] for key in keys]
+    seconds: dict[str, list[float]] = {name: [] for name in models}
+    for number in range(-1, rounds):  # the first round warms up and is not counted
+        for name in list(models)[:: -1 if number % 2 else 1]:
+            if number < 0 and models[name].sampling.sampler == "ddpm":
+                # what is loaded at the first call needs no hundred steps
+                sampled(dataclasses.replace(models[name], sampling=_short(models[name].sampling)), some[0], task)
+                continue
+            spent = sum(sampled(models[name], block, task)[1] for block in some)
+            if number >= 0:
+                seconds[name].append(spent)
+            sys.stderr.write(".")
+            sys.stderr.flush()
+    sys.stderr.write("\n")
+    return seconds
+
+
+def _short(sampling: SceneSampling) -> SceneSampling:
+    return dataclasses.replace(sampling, num_steps=1)
+
+
+def spread_of(ratios: Sequence[float]) -> str:
+    """Median [least, greatest]."""
+    return f"{statistics.median(ratios):.1f} [{min(ratios):.1f}, {max(ratios):.1f}]"
+
+
+def ratio(own: EpisodeScores, reference: EpisodeScores, measure: str, seed: int = 0) -> Interval:
+    """A measure, mean over the horizons, over that of another sampler on the same windows; bootstrap over episodes."""
+    top, bottom = own.measure(measure).sum(axis=1), reference.measure(measure).sum(axis=1)
+    return bootstrap_ratio(top, bottom, own.episode, np.random.default_rng(seed))
+
+
+def as_ratio(found: Interval) -> str:
+    """Value [low, high]."""
+    return f"{found.value:.3f} [{found.low:.3f}, {found.high:.3f}]"
+
+
+def horizon_table(title: str, measure: str, scores: dict[str, EpisodeScores], unit: float) -> list[str]:
+    """A measure at every horizon."""
+    lines = [f"\n{title}\n", "| sampler | " + " | ".join(str(h) for h in HORIZONS) + " |", "|---|" + "---|" * len(HORIZONS)]
+    for name, found in scores.items():
+        lines.append(f"| {name} | " + " | ".join(f"{value / unit:.4f}" for value in found.mean(measure)) + " |")
+    return lines
+
+
+def step_table(scores: dict[str, EpisodeScores]) -> list[str]:
+    """Quantiles of the lengths of steps, in cells."""
+    lines = [
+        "| sampler | mean | " + " | ".join(f"{level:.0%}" for level in LEVELS) + " |",
+        "|---|" + "---|" * (1 + len(LEVELS)),
+    ]
+    for name, found in scores.items():
+        quantiles = step_quantiles(found.steps.sum(axis=0), LEVELS) / prison_map.CELL_M
+        mean = found.share("step_length").sum() / found.count.sum() / prison_map.CELL_M
+        lines.append(f"| {name} | {mean:.2f} | " + " | ".join(f"{value:.2f}" for value in quantiles) + " |")
+    return lines
+
+
+def main_table(scores: dict[str, EpisodeScores], seconds: dict[str, list[float]]) -> list[str]:
+    """A row a variant: speed, and the mean of every measure over the horizons."""
+    lines = []
+    paper = seconds[THE_PAPERS]
+    for name, found in scores.items():
+        speed = spread_of([p / own for p, own in zip(paper, seconds[name], strict=True)])
+        cells = [speed, as_ratio(ratio(found, scores[DDPM], "energy_score"))]
+        cells += [f"{found.mean(m).mean() / SIDE_M:.4f}" for m in ("energy_score", "mean_error", "ade", "min_ade_at")]
+        cells.append(f"{found.mean('coverage_90').mean():.1%}")
+        lines.append(f"| {name} | " + " | ".join(cells) + " |")
+    return lines
+
+
+def parser(page: str) -> argparse.ArgumentParser:
+    """What the scene benchmarks have in common."""
+    made = argparse.ArgumentParser(formatter_class=argparse.RawDescriptionHelpFormatter)
+    made.add_argument("--checkpoint", default="prison", help="trained by diffusion: a file or a shipped name")
+    made.add_argument("--tuned", help="the same, tuned for few steps; the default's rows use it")
+    made.add_argument("--data", type=Path, nargs="+", default=[DATA / name for name in SETS], help="folders of logs, or npz")
+    made.add_argument("--windows", type=int, default=300, help="in all sets")
+    made.add_argument("--block", type=int, default=25, help="windows sampled at once")
+    made.add_argument("--hypotheses", type=int, default=30)
+    made.add_argument("--seed", type=int, default=0)
+    made.add_argument("--work", type=Path, default=WORK)
+    made.add_argument("--publish", type=Path, help=f"folder for {page}")
+    return made
+
+
+def started(options: argparse.Namespace) -> dict[str, SceneModel] | None:
+    """The models of the checkpoints, "plain" and "tuned"; None, with the reason printed, where something is not here."""
+    torch.set_num_threads(1)
+    try:
+        names = {"plain": options.checkpoint} | ({"tuned": options.tuned} if options.tuned else {})
+        models = {kind: load_scene(find_checkpoint(name)) for kind, name in names.items()}
+    except CadenceError as error:
+        print(f"skipped: {error}")
+        return None
+    missing = [path for path in options.data if not path.exists()]
+    if missing:
+        print(f"skipped: {missing[0]} is not here")
+        return None
+    return models
+
+
+def facts(options: argparse.Namespace, task: Task) -> dict[str, object]:
+    """What both pages say of the windows and the network."""
+    names = [options.checkpoint, *([options.tuned] if options.tuned else [])]
+    return {
+        "num_windows": task.num_windows,
+        "num_episodes": len({int(e) for block in task.blocks.values() for e in block.episode}),
+        "hypotheses": task.num_hypotheses,
+        "checkpoint": " and ".join(checkpoint_hash(find_checkpoint(name)) for name in names),
+        "versions": ", ".join(f"{name} {number}" for name, number in versions().items()),
+        "arguments": f"--windows {options.windows} --hypotheses {options.hypotheses} --seed {options.seed}",
+    }
+
+
+def main() -> int:
+    """The page, printed and published; 1 where the default misses the claim."""
+    made = parser("scene_samplers.md")
+    made.description = __doc__
+    made.add_argument("--rounds", type=int, default=5, help="of the timing")
+    made.add_argument("--timed-windows", type=int, default=6)
+    options = made.parse_args()
+    trained = started(options)
+    if trained is None:
+        return 0
+    sets = load_sets(options.data, options.work)
+    blocks = cut_blocks(sets, options.windows, options.block, options.seed)
+    task = Task(blocks, mountain(), options.hypotheses, options.work / "scores")
+    chosen = variants("tuned" in trained)
+    base = {v.name: trained["tuned" if v.is_tuned else "plain"] for v in chosen}
+    timed = {v.name: dataclasses.replace(base[v.name], sampling=v.timed or v.sampling) for v in chosen}
+    seconds = time_all(task, timed, options.timed_windows, options.rounds)
+    scores = score_all(task, {v.name: dataclasses.replace(base[v.name], sampling=v.sampling) for v in chosen})
+    speed = [p / own for p, own in zip(seconds[THE_PAPERS], seconds[DEFAULT], strict=True)]
+    quality = ratio(scores[DEFAULT], scores[DDPM], "energy_score")
+    text = HEAD.format(
+        speed=spread_of(speed), quality=as_ratio(quality), rounds=options.rounds, timed=options.timed_windows,
+        **facts(options, task),
+    )  # fmt: skip
+    lines = main_table(scores, seconds)
+    lines += [STEPS_HEAD, *step_table({"the true tracks": truth_scores(task)} | scores), HORIZONS_HEAD]
+    for title, measure, unit in MEASURES:
+        lines += horizon_table(title, measure, scores, unit)
+    text += "\n".join(lines) + "\n"
+    sys.stdout.write(text)
+    if options.publish is not None:
+        write_atomic(options.publish / "scene_samplers.md", text)
+    return 0 if statistics.median(speed) >= CLAIM and quality.value <= TOLERANCE else 1
+
+
+MEASURES = (
+    ("Energy score", "energy_score", SIDE_M),
+    ("Error of the mean", "mean_error", SIDE_M),
+    ("Displacement error at the step", "displacement_error", SIDE_M),
+    ("ADE up to the step", "ade", SIDE_M),
+    ("minADE at the step", "min_ade_at", SIDE_M),
+    ("Share of the 90 % regions that hold the truth", "coverage_90", 1.0),
+)
+
+HEAD = """# Which sampler draws forecasts fastest without making them worse?
+
+    python benchmarks/scene_samplers.py {arguments} --rounds {rounds} --timed-windows {timed}
+
+The default draws **{speed} times** as many hypotheses a second as the paper's procedure, at **{quality}** times
+the energy score of 100 steps of DDPM. The aim is 20 times at no more than 1.02.
+
+Windows: {num_windows} moments of {num_episodes} episodes of the original Prison Escape simulator (three sets, seeds 250 to
+299, none of them trained on), every step equally likely, as many of each set; {hypotheses} hypotheses each, the start known,
+one thread. Checkpoint: {checkpoint}. Versions: {versions}.
+
+Speed: hypotheses a second over those of the paper's procedure, median [least, greatest] of {rounds} rounds of {timed}
+windows; a ratio is of processor times of the same round, and all rows run the same network code. The other columns are means
+over the horizons 0, 29, 59, 89 and 119, distances over the map's side. Ratio: energy score over that of DDPM with 100 steps on
+the same windows, with a 95 % interval by bootstrap over episodes. All rows start from the same noise. Rows that do not say
+otherwise are neither guided nor repaired.
+
+The paper's procedure: 100 steps of DDPM on the cosine schedule, detections read again for every hypothesis at every step,
+algorithm 1 on every posterior mean (Adam, 8 iterations, learning rate 0.01, through autograd).
+
+| sampler | speed | ratio of energy scores | energy score | error of the mean | ADE | minADE | 90 % region |
+|---|---|---|---|---|---|---|---|
+"""
+
+STEPS_HEAD = """
+## Lengths of steps
+
+In cells of 21 m: the mean, and lengths that the given share of the steps does not exceed. The simulator moves between whole
+cells, so that its steps are 0 or about 7 to 8 cells; forecasts are straight within four steps.
+"""
+
+HORIZONS_HEAD = """
+## By horizon
+
+Steps 0, 29, 59, 89 and 119; distances over the map's side."""
+
+
+if __name__ == "__main__":
+    sys.exit(main())
