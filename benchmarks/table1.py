@@ -26,6 +26,7 @@ from typing import Any
 import numpy as np
 
 from cadence.diffusion.absolute import AbsoluteSampling
+from cadence.diffusion.scene import SceneSampling
 from cadence.errors import CadenceError, InputError
 from cadence.worlds.recordings import Recordings
 from pipeline.checkpoints import checkpoint_hash, find_checkpoint, read_info
@@ -461,6 +462,7 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--training-episodes", type=int, default=300, help="of each set, for the library and the filters")
     parser.add_argument("--all-episodes", type=int, default=2000, help='of each set, for "library, all episodes"')
     parser.add_argument("--paper-sampler", choices=("ddpm", "ddim", "dpmpp"), default="ddpm")
+    parser.add_argument("--precision", choices=("float32", "bfloat16"), default="float32", help="of CADENCE's network")
     parser.add_argument("--publish", type=Path, help="folder for table1.md and table1.json")
     parser.add_argument("-q", "--quiet", action="store_true")
     return parser.parse_args()
@@ -470,7 +472,8 @@ def main() -> int:
     """Evaluate, print and publish."""
     args = arguments()
     sampling = AbsoluteSampling(sampler=args.paper_sampler, inpainting="overwrite")
-    config = ForecastConfig(args.windows, args.hypotheses, rivals=(), paper=sampling)
+    scene = SceneSampling(precision=args.precision)
+    config = ForecastConfig(args.windows, args.hypotheses, rivals=(), paper=sampling, scene=scene)
     setup = Setup(args.checkpoints, args.work, config, Progress(args.quiet))
     cases = list(world_cases(args.training_episodes, args.all_episodes))
     if args.reference is not None:
