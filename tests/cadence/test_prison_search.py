@@ -1,6 +1,7 @@
 """The prison's trackers: plans after detections, spirals, the mountain, and the recorded trackers step by step."""
 
 import numpy as np
+
 from cadence.worlds.draws import Draws
 from cadence.worlds.prison_map import MOUNTAIN, SIDE, prison_map
 from cadence.worlds.prison_search import Search, leaves_map, move
