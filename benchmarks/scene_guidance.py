@@ -54,6 +54,7 @@ PER_EPISODE = 60
 """Random moments of an episode among which those near are looked for."""
 CLAIM, TOLERANCE = 0.00641, 1.01
 UNGUIDED, GUIDED, BOTH = "unguided", "guidance on the clean estimate", "guidance on the clean estimate, and repair"
+MOVED, REPAIRED = "default without repair", "repair alone"
 MOUNTAIN_ONLY = "algorithm 1, mountain term only"
 _INK, _PATH, _SEEN, _ROCK = "#1d2733", "#2a6f97", "#e8a33d", "#8d8478"
 
@@ -68,6 +69,8 @@ def models_of(trained: dict[str, SceneModel]) -> dict[str, SceneModel]:
             DEFAULT: SceneSampling(),
             GUIDED: SceneSampling(guidance="clean", is_repaired=False),
             BOTH: SceneSampling(guidance="clean"),
+            MOVED: SceneSampling(is_repaired=False),
+            REPAIRED: SceneSampling(guidance="none"),
         }.items()
     }
     theirs = {
@@ -257,9 +260,9 @@ episodes; so is time (processor time of the whole forecast). The last three rows
 {head}
 {near}
 
-The default leads what crosses the mountain around it at the end (`cadence.constraints.repair`) and does not guide while it
-samples. Guidance on the clean estimate pushes knots inside an obstacle out along the signed distance, as far as the target can
-have come since it was detected; this happens while the track is still uncertain, so that it becomes another one. A track whose
+The default moves the finished track: knots inside the mountain are pushed out along the signed distance, as far as the target
+can have come since it was detected; what still crosses is led around (`cadence.constraints.repair`). Guidance on the clean
+estimate does the same at every sampling step, while the track is still uncertain, so that it becomes another one. A track whose
 last detection is inside stays where it was seen.
 
 The true tracks go inside themselves: in the simulator movers turn away at the circle's edge, but follow it up to some 20 cells

@@ -141,6 +141,17 @@ def even_angles(num_steps: int, start: float = MAX_ANGLE) -> Tensor:
     return torch.linspace(start, 0.0, num_steps + 1, dtype=torch.float64)
 
 
+def even_log_snr(num_steps: int, start: float, end: float) -> Tensor:
+    """Noise levels [S + 1] evenly spaced in the logarithm of signal over noise from `start` to `end`, then none.
+
+    The variable in which DPM-Solver++ is of second order (Lu et al., 2022).
+    """
+    ends = torch.tensor([start, end], dtype=torch.float64)
+    first, last = torch.log(torch.tan(ends)).tolist()
+    levels = torch.atan(torch.exp(torch.linspace(first, last, num_steps, dtype=torch.float64)))
+    return torch.cat([levels, levels.new_zeros(1)])
+
+
 def _rotate(clean: Tensor, noise: Tensor, angle: float) -> Tensor:
     at = torch.tensor(angle)
     return torch.cos(at).to(clean.dtype) * clean + torch.sin(at).to(clean.dtype) * noise
