@@ -9,8 +9,8 @@ METHOD-WORLD-sN and METHOD-WORLD the first that is found counts, for every train
 grammi, paper or cadence, WORLD is prison, narco or reference (which takes those of prison where it has none of its own), SET is
 low, med or high.
 
-    python benchmarks/table1.py --checkpoints runs/table1/checkpoints --publish docs/benchmarks
-    python benchmarks/table1.py --checkpoints DIR --reference ../shared/data/prison_reference --publish docs/benchmarks
+    python benchmarks/table1.py --publish docs/benchmarks
+    python benchmarks/table1.py --reference ../shared/data/prison_reference --publish docs/benchmarks
 """
 
 import argparse
@@ -452,7 +452,7 @@ def page(evaluated: Mapping[str, Evaluated], missing: Sequence[str], command: st
 def arguments() -> argparse.Namespace:
     """What the command line says."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--checkpoints", type=Path, default=Path("runs/table1/checkpoints"))
+    parser.add_argument("--checkpoints", type=Path, default=Path(__file__).parent / "checkpoints")
     parser.add_argument("--work", type=Path, default=Path("runs/table1"))
     parser.add_argument("--reference", type=Path, help="folder of recorded logs: low, med, high")
     parser.add_argument("--extra", type=Path, help="npz of more recorded episodes of the set low, for the library")
