@@ -30,8 +30,9 @@ _START, _END = MAX_ANGLE - 0.04, 0.08
 """Noise levels that DPM-Solver++ starts from and takes its last step at; evenly spaced in log SNR between them, six steps agree
 with 25 in every score and in the lengths of steps, where eight evenly spaced angles made hypotheses too narrow."""
 
-_CHORD = 0.05
-"""What guidance keeps from obstacles beside the margin, in pieces of the future."""
+_SLACK = {"clean": 0.25, "final": 0.05}
+"""What guidance keeps from obstacles beside the margin, in pieces of the future, by the stage at which it moves a track: between
+two knots on an obstacle's edge a straight line cuts through it, and what is moved while sampling is moved again."""
 
 
 @dataclass(frozen=True)
@@ -176,12 +177,11 @@ class _Tracks:
         limited: Tensor = displacement * (longest / length.clamp_min(1e-6)).clamp(max=1.0)
         return limited
 
-    def guided(self, displacement: Tensor, stage: str) -> Tensor:
+    def guided(self, displacement: Tensor, stage: Literal["clean", "final"]) -> Tensor:
         """Clean estimates moved out of obstacles, at the stage at which that is asked for."""
         if self.sampling.guidance != stage or not self.obstacles.count:
             return displacement
-        # between two knots on the edge of an obstacle a straight line cuts through it
-        slack_m = _CHORD * self.config.stride * self.config.unit_step_m
+        slack_m = _SLACK[stage] * self.config.stride * self.config.unit_step_m
         constraint = ObstacleConstraint(self.obstacles, self.sampling.margin_m + slack_m, self.offset_m)
         track = to_track(displacement, self.pieces, self.config) + self.last_m
         moved = clean_estimate_guidance(track, [constraint], self.reach_m)
