@@ -31,8 +31,8 @@ _START, _END = MAX_ANGLE - 0.04, 0.08
 with 25 in every score and in the lengths of steps, where eight evenly spaced angles made hypotheses too narrow."""
 
 _SLACK = {"clean": 0.25, "final": 0.05}
-"""What guidance keeps from obstacles beside the margin, in pieces of the future, by the stage at which it moves a track. Between
-two knots on an obstacle's edge a straight line cuts through it, and what is moved while sampling is moved again."""
+"""What guidance keeps from obstacles beside the margin, in pieces of the future, by the stage at which it moves a track: a
+straight line between two knots on an edge cuts through the obstacle, and what is moved while sampling is moved again."""
 
 
 @dataclass(frozen=True)
