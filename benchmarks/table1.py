@@ -34,9 +34,10 @@ from pipeline.config import config_as_dict
 from pipeline.forecast_leads import averaged, count, relative_lead, verdicts
 from pipeline.forecast_scores import HORIZONS, MEASURES, SHARES, EpisodeScores
 from pipeline.forecast_tables import TITLES, line, mean_interval, number, with_interval
-from pipeline.forecasters import FORECAST_RIVALS, Forecaster, Samplings, load_forecaster
+from pipeline.forecasters import FORECAST_RIVALS, Samplings, load_forecaster
 from pipeline.forecasts import ForecastConfig, ForecastRun, forecast_windows, truth_scores
 from pipeline.manifest import write_atomic
+from pipeline.placed_draws import Forecaster
 from pipeline.progress import Progress
 from pipeline.recordings import RecordingsConfig, load_recordings
 

@@ -1,10 +1,8 @@
 """Checkpoints of the paper's preset as estimators, and the grid they need."""
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import torch
-from torch import Tensor
 
 from cadence.constraints.obstacles import Obstacles
 from cadence.diffusion.absolute import AbsoluteConfig, AbsoluteModel, AbsoluteSampling
@@ -13,8 +11,6 @@ from cadence.network.trajectory import TrajectoryNetwork
 from cadence.types import Context
 from pipeline.checkpoints import load_weights, network_config, read_info
 from pipeline.windows import GridConfig, MissionWindows
-
-_WINDOWS_AT_ONCE = 32
 
 
 def load_absolute(weights: Path, sampling: AbsoluteSampling | None = None) -> AbsoluteModel:
@@ -37,14 +33,3 @@ def absolute_grid(config: AbsoluteConfig, stride_steps: int = 16) -> GridConfig:
 def placed(model: AbsoluteModel, windows: MissionWindows, obstacles: Obstacles | None = None) -> AbsoluteModel:
     """The model for the windows of one mission."""
     return model.placed(Context(torch.from_numpy(windows.datum_m)), obstacles)
-
-
-def draw_absolute(
-    model: AbsoluteModel, windows: MissionWindows, num_hypotheses: int, obstacles: Obstacles
-) -> Iterator[tuple[Tensor, Tensor, Tensor, list[list[str]]]]:
-    """Windows in chunks: their indices, positions [B', K, A, T, 2] about the datum, weights [B', K], status [B'][A]."""
-    for begin in range(0, windows.batch.num_windows, _WINDOWS_AT_ONCE):
-        part = torch.arange(begin, min(begin + _WINDOWS_AT_ONCE, windows.batch.num_windows))
-        here = model.placed(Context(torch.from_numpy(windows.datum_m)[part]), obstacles)
-        drawn = here.sample(windows.batch[part], num_hypotheses)
-        yield part, drawn.position_m.double(), drawn.weight.double(), [list(row) for row in drawn.status]

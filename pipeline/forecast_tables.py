@@ -1,8 +1,6 @@
 """Scored forecasts as tables: rows with intervals, paired comparisons, and their JSON, CSV and Markdown."""
 
-import csv
 import dataclasses
-import io
 import json
 import math
 from collections.abc import Mapping, Sequence
@@ -13,7 +11,7 @@ import numpy as np
 
 from cadence.metrics import Interval, bootstrap_ratio
 from pipeline.forecast_scores import HORIZONS, MEASURES, EpisodeScores, Float64s, step_quantiles
-from pipeline.score_tables import without_nan
+from pipeline.score_tables import rows_as_csv, without_nan
 
 FORECAST_VERSION = 1
 STEP_LEVELS = (0.05, 0.25, 0.5, 0.75, 0.95, 0.99)
@@ -182,12 +180,7 @@ def as_json(report: ForecastReport) -> str:
 
 def as_csv(report: ForecastReport) -> str:
     """forecast.csv: a line per row."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow([field.name for field in dataclasses.fields(ForecastRow)])
-    for row in report.rows:
-        writer.writerow(["" if value is None else value for value in dataclasses.astuple(row)])
-    return text.getvalue()
+    return rows_as_csv(ForecastRow, report.rows)
 
 
 def as_markdown(report: ForecastReport) -> str:

@@ -17,22 +17,10 @@ from cadence.types import Context, Estimator
 from cadence.worlds.recordings import Recordings
 from pipeline.absolute import load_absolute
 from pipeline.checkpoints import find_checkpoint, read_info
+from pipeline.placed_draws import Forecaster
 from pipeline.scene import load_scene
 from pipeline.train_rivals import load_rival
 from pipeline.training_run import OUTPUTS
-
-
-class Forecaster(Protocol):
-    """An estimator that may want to know where its windows are, and what is in the way there."""
-
-    @property
-    def name(self) -> str:
-        """What it is called."""
-        ...
-
-    def placed(self, context: Context, obstacles: Obstacles | None = None) -> Estimator:
-        """The estimator for the windows of a context."""
-        ...
 
 
 class Placeable(Protocol):

@@ -29,8 +29,9 @@ from pipeline.checkpoints import checkpoint_hash, find_checkpoint
 from pipeline.config import config_as_dict
 from pipeline.forecast_scores import HORIZONS, EpisodeScores, score_forecasts
 from pipeline.forecast_tables import ForecastFacts, as_csv, as_json, as_markdown, headline, pool
-from pipeline.forecasters import FORECAST_RIVALS, Forecaster, Samplings, label_of, load_forecaster
+from pipeline.forecasters import FORECAST_RIVALS, Samplings, label_of, load_forecaster
 from pipeline.manifest import StageResult, hash_file, run_stage, write_atomic
+from pipeline.placed_draws import Forecaster
 from pipeline.progress import Progress
 from pipeline.provenance import versions
 from pipeline.recordings import RecordingsConfig, RecordingSet, load_recordings

@@ -23,15 +23,16 @@ from cadence.diffusion.general import GeneralModel
 from cadence.diffusion.scene import SceneSampling
 from cadence.errors import ConfigError, DeviceError
 from cadence.network.residual import ResidualNetwork, ResidualNetworkConfig
-from cadence.types import Detections, WindowBatch
-from pipeline.absolute import absolute_grid, draw_absolute, load_absolute
+from cadence.types import Context, Detections, WindowBatch
+from pipeline.absolute import absolute_grid, load_absolute
 from pipeline.checkpoints import DEFAULT, checkpoint_hash, find_checkpoint, load_weights, network_config, read_info
 from pipeline.hypothesis_tables import hypothesis_rows, window_rows
 from pipeline.ingest import CATALOGUE_NAME, read_catalogue
 from pipeline.manifest import StageResult, run_stage
 from pipeline.obstacles import read_obstacles
+from pipeline.placed_draws import draw_placed
 from pipeline.progress import Progress
-from pipeline.scene import draw_scene, load_scene, scene_grid
+from pipeline.scene import load_scene, scene_context, scene_grid
 from pipeline.tables import read_table, write_table
 from pipeline.windows import Grid, GridConfig, MissionWindows, build_windows, fit_tracks, later_detections, plan_grid
 
@@ -153,13 +154,15 @@ def _plan(config: InferConfig, detections: pa.Table, obstacles: Obstacles, weigh
         grid = plan_grid(detections, scene_grid(scene.config, config.grid.stride_steps))
         windows = build_windows(detections, grid, config.seed, config.default_sigma_m)
         limits = Obstacles.none() if config.guidance.mode == "none" else obstacles
-        draws = draw_scene(scene, windows, start_ns, config.num_hypotheses, limits)
+        draws = draw_placed(scene, windows.batch, scene_context(windows, start_ns), config.num_hypotheses, limits)
         return _Plan(grid, windows, draws, {"preset": "scene"})
     if weights is not None and preset == "paper":
         paper = load_absolute(weights, config.paper)
         grid = plan_grid(detections, absolute_grid(paper.config, config.grid.stride_steps))
         windows = build_windows(detections, grid, config.seed, config.default_sigma_m)
-        return _Plan(grid, windows, draw_absolute(paper, windows, config.num_hypotheses, obstacles), {"preset": "paper"})
+        context = Context(torch.from_numpy(windows.datum_m))
+        draws = draw_placed(paper, windows.batch, context, config.num_hypotheses, obstacles)
+        return _Plan(grid, windows, draws, {"preset": "paper"})
     grid = plan_grid(detections, config.grid)
     windows = build_windows(detections, grid, config.seed, config.default_sigma_m)
     model = fitted_model(config, detections, grid, windows, weights)

@@ -1,13 +1,10 @@
 """Checkpoints of the scene preset as estimators, the grid they need, and what they are told of a mission."""
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import torch
-from torch import Tensor
 
-from cadence.constraints.obstacles import Obstacles
 from cadence.diffusion.scene import SceneModel, SceneSampling
 from cadence.diffusion.scene_frame import SceneConfig
 from cadence.errors import ConfigError
@@ -16,7 +13,6 @@ from cadence.worlds.recordings import NUM_STEPS
 from pipeline.checkpoints import load_weights, network_config, read_info
 from pipeline.windows import GridConfig, MissionWindows
 
-_WINDOWS_AT_ONCE = 32
 _CONTEXT_STEPS = 4320
 """The longest mission of the paper's worlds."""
 
@@ -37,17 +33,7 @@ def scene_grid(config: SceneConfig, stride_steps: int = 16) -> GridConfig:
     return GridConfig(config.step_s, 1, NUM_STEPS - 1, stride_steps, _CONTEXT_STEPS)
 
 
-def draw_scene(
-    model: SceneModel, windows: MissionWindows, start_ns: int, num_hypotheses: int, obstacles: Obstacles
-) -> Iterator[tuple[Tensor, Tensor, Tensor, list[list[str]]]]:
-    """Windows in chunks: their indices, positions [B', K, A, T, 2] about the datum, weights [B', K], status [B'][A].
-
-    The network is told how long ago the mission began (`start_ns`), neither goals nor trackers.
-    """
-    datum_m = torch.from_numpy(windows.datum_m)
+def scene_context(windows: MissionWindows, start_ns: int) -> Context:
+    """What the network is told of a mission: where, and how long ago the mission began; neither goals nor trackers."""
     elapsed_s = torch.from_numpy((windows.origins_ns - start_ns).astype(np.float64) * 1e-9).clamp_min(0.0)
-    for begin in range(0, windows.batch.num_windows, _WINDOWS_AT_ONCE):
-        part = torch.arange(begin, min(begin + _WINDOWS_AT_ONCE, windows.batch.num_windows))
-        here = model.placed(Context(datum_m[part], elapsed_s[part]), obstacles)
-        drawn = here.sample(windows.batch[part], num_hypotheses)
-        yield part, drawn.position_m.double(), drawn.weight.double(), [list(row) for row in drawn.status]
+    return Context(torch.from_numpy(windows.datum_m), elapsed_s)

@@ -5,7 +5,7 @@ import dataclasses
 import io
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -119,10 +119,15 @@ def as_json(report: ScoreReport) -> str:
 
 def as_csv(report: ScoreReport) -> str:
     """scores.csv: a line per row."""
+    return rows_as_csv(ScoreRow, report.rows)
+
+
+def rows_as_csv(kind: type[Any], rows: Iterable[Any]) -> str:
+    """Instances of the dataclass `kind`, a line each under the names of its fields; None is an empty cell."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow([field.name for field in dataclasses.fields(ScoreRow)])
-    for row in report.rows:
+    writer.writerow([field.name for field in dataclasses.fields(kind)])
+    for row in rows:
         writer.writerow(["" if value is None else value for value in dataclasses.astuple(row)])
     return text.getvalue()
 

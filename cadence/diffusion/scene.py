@@ -101,11 +101,12 @@ class SceneModel:
         self._check(windows)
         assert self.context is not None
         rows, context = _one_agent_a_row(windows, self.context)
+        network = FrozenScene(self.network, getattr(torch, self.sampling.precision))
         per_chunk = max(1, self.sampling.chunk // num_hypotheses)
         parts = [torch.zeros(0, num_hypotheses, NUM_STEPS, 2, dtype=torch.float64)]
         for begin in range(0, rows.num_windows, per_chunk):
             part = slice(begin, begin + per_chunk)
-            parts.append(self._sample_rows(rows[part], context[part], num_hypotheses))
+            parts.append(self._sample_rows(network, rows[part], context[part], num_hypotheses))
         return scatter_hypotheses(torch.cat(parts), windows)
 
     def _check(self, windows: WindowBatch) -> None:
@@ -118,14 +119,13 @@ class SceneModel:
         if self.context is None or len(self.context.datum_m) != windows.num_windows:
             raise ValueError("SceneModel: the windows need a context of their own; use placed()")
 
-    def _sample_rows(self, windows: WindowBatch, context: Context, num_hypotheses: int) -> Tensor:
+    def _sample_rows(self, network: FrozenScene, windows: WindowBatch, context: Context, num_hypotheses: int) -> Tensor:
         """Hypotheses [R, K, T, 2] in metres relative to the datum."""
         inputs = scene_inputs(windows, context, self.config)
         stream = RowNoise(windows.seeds)
         last_m = _last_detection(windows.detections)
-        tracks = _Tracks(self, inputs.pieces, last_m, context.datum_m, num_hypotheses)
+        tracks = _Tracks(self, inputs.pieces, last_m, context.datum_m)
         pieces = inputs.pieces.repeated(num_hypotheses)
-        network = FrozenScene(self.network, getattr(torch, self.sampling.precision))
         known = network.known(inputs)
 
         def denoise(noisy: Tensor, angle: float) -> Tensor:
@@ -163,7 +163,7 @@ class SceneModel:
 class _Tracks:
     """What moves the pieces [R, K, P, 2] of one chunk of windows: the speed limit, and obstacles."""
 
-    def __init__(self, model: SceneModel, pieces: Pieces, last_m: Tensor, datum_m: Tensor, num_hypotheses: int) -> None:
+    def __init__(self, model: SceneModel, pieces: Pieces, last_m: Tensor, datum_m: Tensor) -> None:
         self.config, self.sampling, self.obstacles = model.config, model.sampling, model.obstacles
         self.pieces, self.last_m = pieces, last_m[:, None, None].float()
         self.offset_m = datum_m[:, None, None].float()

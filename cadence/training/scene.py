@@ -57,7 +57,6 @@ def scene_windows(
     has_start, has_goal, has_trackers = (
         rng.random(len(rows)) < share for share in (told.known_start, told.known_goal, told.trackers)
     )
-    has_start |= recordings.is_detected[recordings.offset[episode]]
     cut = cut_windows(recordings, episode, step, known_start=has_start)
     context = cut.context
     assert context.known_goal_m is not None and context.tracker_m is not None
