@@ -1,0 +1,79 @@
+"""Settings and results of data association. Arrays are numpy: labels, not tensors that a network sees."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+CLUTTER = -1
+"""Label of a detection that no agent caused."""
+
+
+@dataclass(frozen=True)
+class AssociationConfig:
+    """How detections of unknown origin are told apart.
+
+    num_agents     how many agents there are, all through the log; None: unknown, agents come and go
+    max_agents     where the number is unknown: never more than this
+    num_particles  ways to read the log that are followed side by side
+    num_ways       likeliest ways that are kept at a window origin, drawn without bias from the particles
+    clutter_share  share of the detections that no agent caused
+    """
+
+    num_agents: int | None = None
+    max_agents: int = 64
+    num_particles: int = 200
+    num_ways: int = 30
+    clutter_share: float = 0.01
+
+    def __post_init__(self) -> None:
+        if self.num_agents is not None and self.num_agents < 1:
+            raise ValueError("num_agents must be at least 1, or None")
+        if min(self.max_agents, self.num_particles, self.num_ways) < 1:
+            raise ValueError("max_agents, num_particles and num_ways must be at least 1")
+        if not 0.0 <= self.clutter_share < 1.0:
+            raise ValueError("clutter_share must lie in [0, 1)")
+
+
+@dataclass(frozen=True, eq=False)
+class Associations:
+    """What a stream's detections up to one moment may have come from: M weighted ways.
+
+    label       [M, N] int64: agent 0 .. num_agents - 1 of each of the N detections known at that moment, -1 clutter
+    weight      [M] non-negative, sums to one; the likeliest way first
+    num_agents  agents that are numbered in the log as a whole; some may have no detection yet
+    """
+
+    label: NDArray[np.int64]
+    weight: NDArray[np.float64]
+    num_agents: int
+
+    def __post_init__(self) -> None:
+        if self.label.ndim != 2 or self.weight.shape != self.label.shape[:1] or len(self.weight) == 0:
+            raise ValueError(
+                f"Associations: labels {self.label.shape} and weights {self.weight.shape}; expected [M, N] and [M]"
+            )
+        if np.any(self.weight < 0) or abs(float(self.weight.sum()) - 1.0) > 1e-6:
+            raise ValueError("Associations.weight must not be negative and must sum to one")
+        if self.label.size and not CLUTTER <= int(self.label.min()) <= int(self.label.max()) < self.num_agents:
+            raise ValueError(f"Associations.label must lie in [-1, {self.num_agents})")
+
+    @property
+    def num_ways(self) -> int:
+        """Number of ways M."""
+        return len(self.weight)
+
+    @property
+    def num_detections(self) -> int:
+        """Number of detections N."""
+        return int(self.label.shape[1])
+
+
+def agent_probability(associations: Associations) -> NDArray[np.float64]:
+    """P(detection came from agent) [N, A + 1], rows sum to one; the last column is clutter."""
+    num_agents = associations.num_agents
+    out = np.zeros((associations.num_detections, num_agents + 1))
+    column = np.where(associations.label == CLUTTER, num_agents, associations.label)
+    detection = np.broadcast_to(np.arange(associations.num_detections), column.shape)
+    np.add.at(out, (detection, column), np.broadcast_to(associations.weight[:, None], column.shape))
+    return out
