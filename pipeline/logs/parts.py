@@ -1,0 +1,74 @@
+"""Which files are parts of one recording: recorders of ROS 2 split a bag and name its parts in `metadata.yaml`.
+
+Names alone never join files: `run_0.mcap` and `run_1.mcap` may be two missions.
+"""
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+METADATA_NAME: Final = "metadata.yaml"
+_MAX_METADATA_BYTES: Final = 2**24
+_LIST: Final = re.compile(r"^( *)relative_file_paths: *\n((?:\1 *- .*\n?)+)", re.MULTILINE)
+_NUMBERED: Final = re.compile(r"(.+)_\d+")
+
+
+def group_parts(paths: Sequence[Path]) -> list[tuple[Path, ...]]:
+    """The missions among `paths`, in the order of their first paths, each as its parts in the order of the recording.
+
+    A folder with `metadata.yaml` stands for the parts that are named there and present. Files that the `metadata.yaml`
+    beside them names together belong together; every other path is a mission of its own. Repetitions are left out.
+    """
+    given = [part for path in paths for part in recorded_parts(path) or (path,)]
+    groups: dict[Path, list[Path]] = {}
+    seen: set[Path] = set()
+    for path in given:
+        if path.resolve() in seen:
+            continue
+        seen.add(path.resolve())
+        is_part = path.name in _names(path.parent)
+        groups.setdefault((path.parent if is_part else path).resolve(), []).append(path)
+    return [tuple(sorted(group, key=_order)) for group in groups.values()]
+
+
+def recorded_parts(folder: Path) -> tuple[Path, ...]:
+    """The files that `folder/metadata.yaml` names and that are there; empty where there are none."""
+    return tuple(folder / name for name in _names(folder) if (folder / name).is_file())
+
+
+def missing_parts(paths: Sequence[Path]) -> tuple[Path, ...]:
+    """Files that the `metadata.yaml` beside one of `paths` names as parts of the same recording, but that are not there."""
+    absent: dict[Path, None] = {}
+    for folder in dict.fromkeys(path.parent for path in paths):
+        names = _names(folder)
+        if any(path.name in names for path in paths if path.parent == folder):
+            absent |= {folder / name: None for name in names if not (folder / name).is_file()}
+    return tuple(absent)
+
+
+def mission_name(paths: Sequence[Path]) -> str:
+    """What a mission of these parts is called: the stem of the only part, or what the numbered parts have in common."""
+    stems = [path.stem for path in paths]
+    matches = [_NUMBERED.fullmatch(stem) for stem in stems]
+    common = {match[1] for match in matches if match}
+    return common.pop() if len(stems) > 1 and None not in matches and len(common) == 1 else stems[0]
+
+
+def _order(path: Path) -> int:
+    names = _names(path.parent)
+    return names.index(path.name) if path.name in names else 0
+
+
+def _names(folder: Path) -> list[str]:
+    """Names of the parts in the order of `metadata.yaml`; empty where there is none that can be read."""
+    try:
+        with (folder / METADATA_NAME).open(encoding="utf-8") as file:
+            text = file.read(_MAX_METADATA_BYTES)
+    except (OSError, ValueError):
+        return []
+    match = _LIST.search(text)
+    lines = match[2].splitlines() if match else []
+    # Old recorders wrote the name of the folder, too; a path that leads elsewhere is not followed.
+    names = (Path(line.strip()[1:].strip().strip("'\"")).name for line in lines)
+    return list(dict.fromkeys(name for name in names if name))
