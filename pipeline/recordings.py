@@ -133,8 +133,9 @@ def read_recordings(path: Path) -> tuple[Recordings, dict[str, Any]]:
             arrays = {name: file[name] for name in file.files}
         if int(arrays.pop("format")) != FORMAT:
             raise ValueError("another format")
-        own = {name: arrays.pop(name) for name in Recordings.__dataclass_fields__}
-        return Recordings(**{**own, "step_s": float(own["step_s"])}), arrays
+        own = {name: arrays.pop(name) for name in Recordings.__dataclass_fields__ if name != "num_agents"}
+        num_agents = int(arrays.pop("num_agents", 1))
+        return Recordings(**{**own, "step_s": float(own["step_s"])}, num_agents=num_agents), arrays
     except (OSError, ValueError, KeyError, EOFError) as error:
         raise InputError(f"{path}: not readable episodes ({error}); remove the file, it is made again") from error
     except Exception as error:  # zipfile.BadZipFile and zlib.error, which share no base

@@ -10,6 +10,7 @@ import torch
 from torch import nn
 
 from cadence.diffusion.scene_frame import SceneConfig
+from cadence.network.attention import Team
 from cadence.network.scene import Pieces, SceneInputs, SceneNetwork
 from cadence.training.loop import Loss, Trainer
 from cadence.training.scene import Dropout, SceneWindows, diffusion_loss, energy_loss, scene_windows
@@ -113,7 +114,7 @@ def train_scene_network(
     @torch.no_grad()
     def validate(network: nn.Module) -> float:
         generator = torch.Generator().manual_seed(1)
-        parts = [validation[begin : begin + _VALIDATION_BATCH] for begin in range(0, len(validation), _VALIDATION_BATCH)]
+        parts = validation.parts(_VALIDATION_BATCH)
         total = sum(float(_loss(network, part, scene, model, generator)) * len(part) for part in parts)
         return total / len(validation)
 
@@ -148,4 +149,7 @@ def _joined(parts: list[SceneWindows]) -> SceneWindows:
             columns.setdefault(name, []).append(value)
     joined = {name: torch.cat(values) for name, values in columns.items()}
     pieces = Pieces(*(joined.pop(name) for name in ("last", "start", "duration", "span")))
-    return SceneWindows(SceneInputs(**joined, pieces=pieces), torch.cat([part.clean for part in parts]))
+    teams = [part.team for part in parts if part.team is not None]
+    team = Team(torch.cat([team.is_present for team in teams])) if teams else None
+    clean, is_real = (torch.cat([getattr(part, name) for part in parts]) for name in ("clean", "is_real"))
+    return SceneWindows(SceneInputs(**joined, pieces=pieces), clean, is_real, team)

@@ -56,13 +56,13 @@ class EpisodePool:
 
         `ConfigError` for a source with a single episode.
         """
-        if any(len(part) < 2 for part in self.parts):
+        if any(part.num_episodes < 2 for part in self.parts):
             raise ConfigError(
                 "sources: one of them has a single episode; two are needed, or episodes for validation of their own"
             )
-        numbers = [min(max(1, round(share * len(part))), len(part) - 1) for part in self.parts]
-        first = [part.select(slice(0, len(part) - num)) for part, num in zip(self.parts, numbers, strict=True)]
-        last = [part.select(slice(len(part) - num, None)) for part, num in zip(self.parts, numbers, strict=True)]
+        numbers = [min(max(1, round(share * part.num_episodes)), part.num_episodes - 1) for part in self.parts]
+        first = [part.select(slice(0, part.num_episodes - num)) for part, num in zip(self.parts, numbers, strict=True)]
+        last = [part.select(slice(part.num_episodes - num, None)) for part, num in zip(self.parts, numbers, strict=True)]
         return EpisodePool(tuple(first), self.shares), EpisodePool(tuple(last), self.shares)
 
 

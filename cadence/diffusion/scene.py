@@ -19,8 +19,10 @@ from cadence.diffusion.guidance import PaperCost, adam_guidance, clean_estimate_
 from cadence.diffusion.noise import RowNoise
 from cadence.diffusion.sampler import even_angles, even_log_snr, sample_ddim, sample_ddpm, sample_dpmpp_2m
 from cadence.diffusion.scene_frame import SceneConfig, future_of, scene_inputs, to_pieces, to_track
+from cadence.diffusion.scene_team import agent_rows, shared_detections
 from cadence.diffusion.schedule import MAX_ANGLE, clean_from, cosine_schedule
 from cadence.errors import ConfigError
+from cadence.network.attention import Team
 from cadence.network.frozen import FrozenScene
 from cadence.network.scene import Pieces, SceneNetwork
 from cadence.types import Context, Detections, HypothesisSet, WindowBatch
@@ -77,7 +79,8 @@ class SceneSampling:
 class SceneModel:
     """A trained network as an `Estimator` for windows that begin now; `placed` binds their context.
 
-    Agents are independent of each other; those without detections are NaN. `obstacles` lie in the mission frame.
+    Networks with attention draw all agents of a window together, others each agent for itself; agents without detections are
+    NaN. `obstacles` lie in the mission frame.
     """
 
     network: SceneNetwork
@@ -100,14 +103,18 @@ class SceneModel:
         """Hypotheses [B, K, A, T, 2]; a window's depend on its seed, not on its neighbours. `ConfigError` for other grids."""
         self._check(windows)
         assert self.context is not None
-        rows, context = _one_agent_a_row(windows, self.context)
+        if self.config.shared_gap_steps:
+            windows = shared_detections(windows)
+        rows = agent_rows(windows, self.context, self.config)
         network = FrozenScene(self.network, getattr(torch, self.sampling.precision))
-        per_chunk = max(1, self.sampling.chunk // num_hypotheses)
+        size = rows.team.num_agents if rows.team is not None else 1  # rows that belong together
+        per_chunk = size * max(1, self.sampling.chunk // (num_hypotheses * size))
         parts = [torch.zeros(0, num_hypotheses, NUM_STEPS, 2, dtype=torch.float64)]
-        for begin in range(0, rows.num_windows, per_chunk):
+        for begin in range(0, rows.windows.num_windows, per_chunk):
             part = slice(begin, begin + per_chunk)
-            parts.append(self._sample_rows(network, rows[part], context[part], num_hypotheses))
-        return scatter_hypotheses(torch.cat(parts), windows)
+            team = rows.team and rows.team[slice(begin // size, (begin + per_chunk) // size)]
+            parts.append(self._sample_rows(network, rows.windows[part], rows.context[part], team, num_hypotheses))
+        return scatter_hypotheses(torch.cat(parts)[rows.is_real], windows)
 
     def _check(self, windows: WindowBatch) -> None:
         step_s = self.config.step_s
@@ -119,7 +126,9 @@ class SceneModel:
         if self.context is None or len(self.context.datum_m) != windows.num_windows:
             raise ValueError("SceneModel: the windows need a context of their own; use placed()")
 
-    def _sample_rows(self, network: FrozenScene, windows: WindowBatch, context: Context, num_hypotheses: int) -> Tensor:
+    def _sample_rows(
+        self, network: FrozenScene, windows: WindowBatch, context: Context, team: Team | None, num_hypotheses: int
+    ) -> Tensor:
         """Hypotheses [R, K, T, 2] in metres relative to the datum."""
         inputs = scene_inputs(windows, context, self.config)
         stream = RowNoise(windows.seeds)
@@ -127,11 +136,12 @@ class SceneModel:
         tracks = _Tracks(self, inputs.pieces, last_m, context.datum_m)
         pieces = inputs.pieces.repeated(num_hypotheses)
         known = network.known(inputs)
+        mates = None if team is None else team.repeated(num_hypotheses)
 
         def denoise(noisy: Tensor, angle: float) -> Tensor:
             flat = noisy.flatten(0, 1)
             told = network.known(inputs.repeated(num_hypotheses)) if self.sampling.encode_each_step else known
-            clean = clean_from("v", network(flat, angle, pieces, told), flat, torch.tensor(angle)).reshape(noisy.shape)
+            clean = clean_from("v", network(flat, angle, pieces, told, mates), flat, torch.tensor(angle)).reshape(noisy.shape)
             return tracks.guided(tracks.limited(clean), "clean")
 
         start = stream.draw((num_hypotheses, self.config.num_pieces, 2))
@@ -196,18 +206,6 @@ class _Tracks:
             return cost.cost(to_track(displacement, self.pieces, self.config) + self.last_m)
 
         return adam_guidance(mean, cost_of, self.sampling.learning_rate, self.sampling.iterations)
-
-
-def _one_agent_a_row(windows: WindowBatch, context: Context) -> tuple[WindowBatch, Context]:
-    """Every active agent of every window as a window of its own."""
-    window, agent = windows.is_active.nonzero(as_tuple=True)
-    d = windows.detections
-    columns = (d.time_s, d.position_m, d.covariance_m2, d.is_observed)
-    seeds = windows.seeds[window] + 7_919 * agent
-    rows = WindowBatch(windows.time_s, Detections(*(value[window, agent][:, None] for value in columns)), seeds, 0)
-    goal = context.known_goal_m
-    mine = dataclasses.replace(context[window], known_goal_m=None if goal is None else goal[window, agent][:, None])
-    return rows, mine
 
 
 def _last_detection(detections: Detections) -> Tensor:

@@ -38,6 +38,9 @@ class SceneConfig:
     num_gap, num_future  pieces from the last detection to now, and from now on
     stride       steps of a piece of the future
     few_steps    evaluations of the few-step sampler that the weights were tuned for; 0: they were not
+    shared_gap_steps  0: it is known whose a detection is, and an agent's track begins at its own last one. Else nobody knows, as
+                 in the paper's unknown origin: every agent is told all detections, and every track leads from the last of them
+                 to where its agent is now within so many steps
     """
 
     network: SceneNetworkConfig = field(default_factory=SceneNetworkConfig)
@@ -50,12 +53,15 @@ class SceneConfig:
     num_future: int = 32
     stride: int = 4
     few_steps: int = 0
+    shared_gap_steps: int = 0
 
     def __post_init__(self) -> None:
         if self.num_future * self.stride < NUM_STEPS or min(self.num_gap, self.stride) < 1:
             raise ValueError(f"num_future * stride must reach {NUM_STEPS} steps, num_gap be at least 1")
-        if min(self.step_s, self.scale_m, self.unit_step_m, self.max_step_m) <= 0 or self.few_steps < 0:
-            raise ValueError("step_s, scale_m, unit_step_m and max_step_m must be positive, few_steps not negative")
+        if min(self.step_s, self.scale_m, self.unit_step_m, self.max_step_m) <= 0:
+            raise ValueError("step_s, scale_m, unit_step_m and max_step_m must be positive")
+        if min(self.few_steps, self.shared_gap_steps) < 0:
+            raise ValueError("few_steps and shared_gap_steps must not be negative")
         if self.num_pieces % 2 ** (len(self.network.multipliers) - 1):
             raise ValueError("num_gap + num_future must be a multiple of 2 for every level of the network but one")
 
@@ -80,7 +86,8 @@ def scene_inputs(windows: WindowBatch, context: Context, config: SceneConfig) ->
     rows, is_observed = seen.rows(config.network.max_detections)
     last = seen.told("absolute", octaves(seen.last, _NUM_OCTAVES))
     summary = [*seen.summary(elapsed), is_goal, goal, last, octaves(goal, _NUM_OCTAVES) * is_goal]
-    pieces = _pieces(seen.last, seen.last_age, config)
+    gap = torch.full_like(seen.last_age, config.shared_gap_steps) if config.shared_gap_steps else seen.last_age
+    pieces = _pieces(seen.last, gap, config)
     return SceneInputs(rows, is_observed, torch.cat(summary, dim=-1), trackers, is_tracker, pieces)
 
 

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from cadence.network.attention import Team
 from cadence.network.scene import Pieces, SceneInputs, SceneNetwork
 from cadence.network.unet import UNet, _Block
 
@@ -24,11 +25,11 @@ class FrozenScene:
         """What R windows tell the blocks of the U-Net, whatever the noise level [R, *] each."""
         return self.unet.shares(self.network.encode(inputs))
 
-    def __call__(self, noisy: Tensor, angle: float, pieces: Pieces, known: list[Tensor]) -> Tensor:
+    def __call__(self, noisy: Tensor, angle: float, pieces: Pieces, known: list[Tensor], team: Team | None = None) -> Tensor:
         """The velocity [R * K, P, 2] for noisy [R * K, P, 2] at one noise level, K rows in a row for each window of `known`."""
         at = torch.tensor([angle])
         features = self.network.features(noisy, at, pieces)
-        return self.unet(features, known, self.network.level_code(at)[0])
+        return self.unet(features, known, self.network.level_code(at)[0], team)
 
 
 class FrozenUNet:
@@ -44,8 +45,8 @@ class FrozenUNet:
         self.unet, self.dtype = unet, dtype
         self._weights = {
             module: _picture_weights(module, dtype)
-            for module in unet.modules()
-            if isinstance(module, nn.Conv1d | nn.ConvTranspose1d)
+            for name, module in unet.named_modules()
+            if isinstance(module, nn.Conv1d | nn.ConvTranspose1d) and not name.startswith("across.")
         }
         self._blocks = [b for blocks in (*unet.down, unet.middle, *unet.up) for b in blocks]
 
@@ -54,7 +55,7 @@ class FrozenUNet:
         active = functional.silu(code)
         return [functional.linear(active, block.modulate[1].weight[:, : code.shape[1]]) for block in self._blocks]
 
-    def __call__(self, trajectory: Tensor, shares: list[Tensor], rest: Tensor) -> Tensor:
+    def __call__(self, trajectory: Tensor, shares: list[Tensor], rest: Tensor, team: Team | None = None) -> Tensor:
         """Answers [R * K, T, out_channels] for [R * K, T, in_channels], K rows in a row for each of the R `shares`.
 
         `rest` [E] is the second part of the condition, the same for all rows.
@@ -63,14 +64,16 @@ class FrozenUNet:
         film = iter([self._film(block, share, rest) for block, share in zip(self._blocks, shares, strict=True)])
         picture = trajectory.to(self.dtype)[:, None].permute(0, 3, 1, 2)
         hidden = self._convolved(unet.stem, picture)
-        skips = []
+        skips: list[Tensor] = []
         for blocks, narrow in zip(unet.down, unet.narrow, strict=True):
             for block in blocks:  # type: ignore[attr-defined]
                 hidden = self._block(block, hidden, next(film))
+            hidden = self._seen(hidden, len(skips) - 1, team)
             skips.append(hidden)
             hidden = self._convolved(narrow, hidden)
         for block in unet.middle:
             hidden = self._block(block, hidden, next(film))  # type: ignore[arg-type]
+        hidden = self._seen(hidden, len(skips) - 1, team)
         skips.pop()
         for widen, blocks in zip(unet.widen, unet.up, strict=True):
             hidden = torch.cat([self._convolved(widen, hidden), skips.pop()], dim=1)
@@ -97,6 +100,13 @@ class FrozenUNet:
         by_window = torch.addcmul(film[1], by_window, film[0])
         hidden = by_window.reshape(rows, 1, steps, channels).permute(0, 3, 1, 2)
         return self._convolved(block.second, functional.silu(hidden, inplace=True)).add_(skip)
+
+    def _seen(self, hidden: Tensor, place: int, team: Team | None) -> Tensor:
+        """Attention between agents, in float32, of pictures [N, C, 1, T]."""
+        if team is None or not self.unet.across:
+            return hidden
+        seen = self.unet.seen(hidden[:, :, 0].float(), place, team)[:, :, None].to(self.dtype)
+        return seen.contiguous(memory_format=torch.channels_last)
 
     def _convolved(self, module: nn.Module, picture: Tensor) -> Tensor:
         """A convolution of pictures [N, C, 1, T]; other modules, which do nothing, give the picture back."""

@@ -12,6 +12,7 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
+from cadence.network.attention import Team
 from cadence.network.encoder import DetectionEncoder
 from cadence.network.unet import NoiseLevelEmbedding, UNet, UNetConfig
 
@@ -36,6 +37,8 @@ class SceneNetworkConfig:
     trackers        the trackers' positions are inputs, where they are given
     places          detections are told as places on the map ("absolute"), as offsets from the last one ("relative"), or both;
                     with "relative" nothing but the learned map tells where on the map a track is
+    attention_heads of the attention between the agents of a window; 0: agents are independent of each other
+    attention_form  "joint" (one softmax over all others) or "paired" (one for each other agent, summed: the paper's text)
     """
 
     width: int = 64
@@ -51,6 +54,8 @@ class SceneNetworkConfig:
     known_goal: bool = True
     trackers: bool = True
     places: Literal["both", "absolute", "relative"] = "both"
+    attention_heads: int = 0
+    attention_form: Literal["joint", "paired"] = "joint"
 
     def __post_init__(self) -> None:
         if self.map_channels < 0 or min(self.encoder_size, self.code_size, self.max_detections, self.map_cells) < 1:
@@ -68,6 +73,8 @@ class SceneNetworkConfig:
             activation="silu",
             condition_size=self.code_size + self.level_size,
             pre_norm=True,
+            attention_heads=self.attention_heads,
+            attention_form=self.attention_form,
         )
 
 
@@ -153,10 +160,10 @@ class SceneNetwork(nn.Module):
         result: Tensor = code + self.last(code)
         return result
 
-    def forward(self, noisy: Tensor, angle: Tensor, pieces: Pieces, code: Tensor) -> Tensor:
+    def forward(self, noisy: Tensor, angle: Tensor, pieces: Pieces, code: Tensor, team: Team | None = None) -> Tensor:
         """The velocity [R, P, 2] for noisy [R, P, 2] at noise levels `angle` [R], windows of codes [R, C]."""
         condition = torch.cat([code, self.level_code(angle)], dim=-1)
-        answer: Tensor = self.unet(self.features(noisy, angle, pieces).mT, condition)
+        answer: Tensor = self.unet(self.features(noisy, angle, pieces).mT, condition, team)
         return answer.mT
 
     def features(self, noisy: Tensor, angle: Tensor, pieces: Pieces) -> Tensor:

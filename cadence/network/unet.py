@@ -12,6 +12,8 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
+from cadence.network.attention import AgentAttention, Team
+
 
 @dataclass(frozen=True)
 class UNetConfig:
@@ -27,6 +29,8 @@ class UNetConfig:
     conditioning    "film" (scale and shift, the paper's text) or "bias" (shift only, the authors' code)
     condition_size  length of the condition vector
     pre_norm        normalise before each convolution, with residual branches that start at zero
+    attention_heads of the attention between agents below the first level and in the middle; 0: agents do not see each other
+    attention_form  "joint" (one softmax over all others) or "paired" (one for each other agent, summed: the paper's text)
     """
 
     in_channels: int = 2
@@ -40,6 +44,8 @@ class UNetConfig:
     conditioning: Literal["film", "bias"] = "film"
     condition_size: int = 64
     pre_norm: bool = False
+    attention_heads: int = 0
+    attention_form: Literal["joint", "paired"] = "joint"
 
     def __post_init__(self) -> None:
         if self.kernel_size % 2 == 0 or self.width % self.num_groups:
@@ -65,6 +71,11 @@ class UNet(nn.Module):
             self.narrow.append(nn.Conv1d(width, width, 3, stride=2, padding=1) if level + 1 < len(widths) else nn.Identity())
             channels = width
         self.middle = _blocks(config, channels, channels)
+        # after the blocks of every level but the first, and in the middle
+        self.across = nn.ModuleList(
+            AgentAttention(width, config.attention_heads, config.num_groups, config.attention_form)
+            for width in ([*widths[1:], widths[-1]] if config.attention_heads else [])
+        )
         self.up = nn.ModuleList()
         self.widen = nn.ModuleList()
         for level in range(len(widths) - 2, -1, -1):
@@ -78,20 +89,22 @@ class UNet(nn.Module):
         nn.init.zeros_(self.head.weight)
         nn.init.zeros_(self.head.bias if self.head.bias is not None else torch.zeros(0))
 
-    def forward(self, trajectory: Tensor, condition: Tensor) -> Tensor:
-        """See the class; every row of the batch is independent."""
+    def forward(self, trajectory: Tensor, condition: Tensor, team: Team | None = None) -> Tensor:
+        """See the class; every row of the batch is independent, but for the rows of a `team` where there is attention."""
         factor = 2 ** (len(self.config.multipliers) - 1)
         if trajectory.shape[-1] % factor:
             raise ValueError(f"UNet: {trajectory.shape[-1]} steps are not a multiple of {factor}")
         hidden = self.stem(trajectory)
-        skips = []
+        skips: list[Tensor] = []
         for blocks, narrow in zip(self.down, self.narrow, strict=True):
             for block in blocks:  # type: ignore[attr-defined]
                 hidden = block(hidden, condition)
+            hidden = self.seen(hidden, len(skips) - 1, team)
             skips.append(hidden)
             hidden = narrow(hidden)
         for block in self.middle:
             hidden = block(hidden, condition)
+        hidden = self.seen(hidden, len(skips) - 1, team)
         skips.pop()
         for widen, blocks in zip(self.widen, self.up, strict=True):
             hidden = torch.cat([widen(hidden), skips.pop()], dim=1)
@@ -99,6 +112,13 @@ class UNet(nn.Module):
                 hidden = block(hidden, condition)
         hidden = self.head_act(self.head_norm(hidden))
         result: Tensor = self.head(torch.cat([hidden, trajectory], dim=1))
+        return result
+
+    def seen(self, hidden: Tensor, place: int, team: Team | None) -> Tensor:
+        """States [N, C, T] after the attention at `place`, where there is one there and a team."""
+        if team is None or not 0 <= place < len(self.across):
+            return hidden
+        result: Tensor = self.across[place](hidden, team)
         return result
 
 

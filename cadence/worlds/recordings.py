@@ -1,4 +1,4 @@
-"""Many recorded or simulated episodes of one target as flat arrays, and forecasting windows cut out of them.
+"""Many recorded or simulated episodes as flat arrays, of one target or of several at once, and forecasting windows out of them.
 
 The protocol is the paper's (Ye et al., CADENCE, MRS 2023, section V): at a step of an episode the detections up to it are
 known, and the next positions are asked for; after the episode's end the target stays where it was.
@@ -25,14 +25,17 @@ Int64s = NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class Recordings:
-    """E episodes with S steps in all, one behind the other; mission frame, metres.
+    """E tracks with S steps in all, one behind the other; mission frame, metres.
+
+    An episode of one target is one track. Of `num_agents` targets at once it is so many tracks in a row, all of one length.
 
     step_s       seconds between steps
-    offset       [E + 1] int64: the rows of episode i are offset[i] ... offset[i + 1] - 1
+    offset       [E + 1] int64: the rows of track i are offset[i] ... offset[i + 1] - 1
     position_m   [S, 2] float32 the target
     is_detected  [S] bool: somebody detected it; detections are exact
     tracker_m    [S, M, 2] float32 the moving trackers, aircraft first; NaN where there is none
     known_goal_m [E, 2] float32 the goal that the trackers know of; NaN where they know none
+    num_agents   targets of every episode
     """
 
     step_s: float
@@ -41,6 +44,7 @@ class Recordings:
     is_detected: NDArray[np.bool_]
     tracker_m: NDArray[np.float32]
     known_goal_m: NDArray[np.float32]
+    num_agents: int = 1
 
     def __post_init__(self) -> None:
         e, s = len(self.offset) - 1, len(self.position_m)
@@ -51,22 +55,29 @@ class Recordings:
         for name, want in expected.items():
             if getattr(self, name).shape != want:
                 raise ValueError(f"Recordings.{name} has shape {getattr(self, name).shape}, expected {want}")
+        if self.num_agents < 1 or e % self.num_agents or np.ptp(self.length.reshape(-1, self.num_agents), axis=1).any():
+            raise ValueError(f"Recordings: {e} tracks are no episodes of {self.num_agents} agents with tracks of one length")
 
     def __len__(self) -> int:
         return len(self.offset) - 1
 
     @property
+    def num_episodes(self) -> int:
+        """Episodes, each of `num_agents` tracks."""
+        return len(self) // self.num_agents
+
+    @property
     def length(self) -> Int64s:
-        """Steps of every episode [E]."""
+        """Steps of every track [E]."""
         return np.diff(self.offset)
 
     def rates(self) -> NDArray[np.float64]:
-        """Share of steps with a detection, an episode [E]."""
+        """Share of steps with a detection, a track [E]."""
         return np.add.reduceat(self.is_detected.astype(np.float64), self.offset[:-1]) / self.length
 
     def select(self, episodes: Sequence[int] | Int64s | slice) -> "Recordings":
         """Some of the episodes, in the order given."""
-        chosen = np.arange(len(self))[episodes]
+        chosen = np.arange(len(self)).reshape(-1, self.num_agents)[episodes].ravel()
         length = self.length[chosen]
         offset = np.concatenate([[0], np.cumsum(length)])
         rows = np.arange(offset[-1]) + np.repeat(self.offset[:-1][chosen] - offset[:-1], length)
@@ -77,13 +88,17 @@ class Recordings:
             self.is_detected[rows],
             self.tracker_m[rows],
             self.known_goal_m[chosen],
+            self.num_agents,
         )
 
     @staticmethod
     def concatenate(parts: Sequence["Recordings"]) -> "Recordings":
-        """All episodes of the parts, in order; missing trackers are absent (NaN). Raises where steps differ in length."""
-        if len({part.step_s for part in parts}) != 1:
-            raise ValueError("Recordings.concatenate: parts with different steps, or none")
+        """All episodes of the parts, in order; missing trackers are absent (NaN).
+
+        Raises where steps differ in length, or episodes in the number of agents.
+        """
+        if len({(part.step_s, part.num_agents) for part in parts}) != 1:
+            raise ValueError("Recordings.concatenate: parts with different steps or numbers of agents, or none")
         num_trackers = max(part.tracker_m.shape[1] for part in parts)
         trackers = [
             np.pad(part.tracker_m, ((0, 0), (0, num_trackers - part.tracker_m.shape[1]), (0, 0)), constant_values=np.nan)
@@ -96,16 +111,18 @@ class Recordings:
             np.concatenate([part.is_detected for part in parts]),
             np.concatenate(trackers),
             np.concatenate([part.known_goal_m for part in parts]),
+            parts[0].num_agents,
         )
 
 
 @dataclass(frozen=True, eq=False)
 class ForecastWindows:
-    """B windows of one agent: what is known, and what came.
+    """B windows of A agents: what is known, and what came.
 
-    windows  their grid is now and the steps after it; the datum is the last detection, or the map's origin without any
-    context  all that `Context` has
-    truth_m  [B, 1, T, 2] relative to the datum, float64
+    windows  their grid is now and the steps after it; the datum is the last detection of the first agent that has one, or the
+             map's origin without any
+    context  all that `Context` has; the trackers are those of the first agent's track
+    truth_m  [B, A, T, 2] relative to the datum, float64
     episode, step  [B] int64 where they were cut
     """
 
@@ -136,8 +153,8 @@ def choose_windows(
         seen = np.concatenate([[0], np.cumsum(recordings.is_detected)])
         rows = np.flatnonzero(seen[1:] > np.repeat(seen[recordings.offset[:-1]], recordings.length))
     chosen = np.sort(rng.choice(rows, num_windows, replace=num_windows > len(rows)))
-    episode = np.searchsorted(recordings.offset, chosen, side="right") - 1
-    return episode, chosen - recordings.offset[episode]
+    track = np.searchsorted(recordings.offset, chosen, side="right") - 1
+    return track // recordings.num_agents, chosen - recordings.offset[track]
 
 
 def cut_windows(
@@ -150,7 +167,7 @@ def cut_windows(
     num_tracker_steps: int = 64,
     seed: int = 0,
 ) -> ForecastWindows:
-    """Windows at the steps [B] of the episodes [B].
+    """Windows at the steps [B] of the episodes [B], all agents of an episode in one window.
 
     Args:
         recordings: what is cut.
@@ -161,37 +178,41 @@ def cut_windows(
         num_tracker_steps: so many steps of the trackers' tracks.
         seed: of the windows' own seeds, which depend on episode and step besides.
     """
-    begin, end = recordings.offset[episode], recordings.offset[episode + 1]
-    now = begin + step
-    if not ((step >= 0) & (now < end)).all():
+    agents = recordings.num_agents
+    track = (episode[:, None] * agents + np.arange(agents)).ravel()  # [B * A]
+    begin, end = recordings.offset[track], recordings.offset[track + 1]
+    now = begin + np.repeat(step, agents)
+    if not ((now >= begin) & (now < end)).all():
         raise ValueError("cut_windows: a step lies outside its episode")
-    has_start = np.broadcast_to(np.asarray(known_start, dtype=bool), begin.shape)
+    has_start = np.repeat(np.broadcast_to(np.asarray(known_start, dtype=bool), step.shape), agents)
     rows, is_observed = _detection_rows(recordings, begin, now, has_start, num_detections)
     last = rows[np.arange(len(rows)), np.maximum(is_observed.sum(axis=1) - 1, 0)]
     place = recordings.position_m.astype(np.float64)
-    datum = np.where(is_observed[:, :1], place[last], 0.0)
+    is_active = is_observed[:, 0].reshape(-1, agents)
+    first = np.arange(len(step)) * agents + is_active.argmax(axis=1)
+    datum = np.where(is_active.any(axis=1)[:, None], place[last[first]], 0.0)  # [B, 2]
     detections = Detections(
-        torch.from_numpy((rows - now[:, None]) * recordings.step_s)[:, None],
-        torch.from_numpy(place[rows] - datum[:, None])[:, None],
-        (_SIGMA_M**2 * torch.eye(2, dtype=torch.float64)).expand(len(rows), 1, rows.shape[1], 2, 2),
-        torch.from_numpy(is_observed)[:, None],
+        torch.from_numpy((rows - now[:, None]) * recordings.step_s).unflatten(0, (-1, agents)),
+        torch.from_numpy(place[rows]).unflatten(0, (-1, agents)) - torch.from_numpy(datum)[:, None, None],
+        (_SIGMA_M**2 * torch.eye(2, dtype=torch.float64)).expand(len(step), agents, rows.shape[1], 2, 2),
+        torch.from_numpy(is_observed).unflatten(0, (-1, agents)),
     )
     seeds = torch.from_numpy((seed * 1_000_003 + episode) * 10_007 + step)
     time_s = torch.arange(NUM_STEPS, dtype=torch.float64) * recordings.step_s
     later = np.minimum(now[:, None] + np.arange(NUM_STEPS), end[:, None] - 1)
-    past = now[:, None] + np.arange(1 - num_tracker_steps, 1)
-    trackers = recordings.tracker_m[np.maximum(past, begin[:, None])]
-    trackers[np.less(past, begin[:, None])] = np.nan
+    past = now[::agents, None] + np.arange(1 - num_tracker_steps, 1)
+    trackers = recordings.tracker_m[np.maximum(past, begin[::agents, None])]
+    trackers[np.less(past, begin[::agents, None])] = np.nan
     context = Context(
         torch.from_numpy(datum),
         torch.from_numpy(step * recordings.step_s),
-        torch.from_numpy(recordings.known_goal_m[episode])[:, None].double(),
+        torch.from_numpy(recordings.known_goal_m[track]).double().unflatten(0, (-1, agents)),
         torch.from_numpy(trackers),
     )
     return ForecastWindows(
         WindowBatch(time_s, detections, seeds, 0),
         context,
-        torch.from_numpy(place[later] - datum[:, None])[:, None],
+        torch.from_numpy(place[later]).unflatten(0, (-1, agents)) - torch.from_numpy(datum)[:, None, None],
         torch.from_numpy(np.asarray(episode, dtype=np.int64)),
         torch.from_numpy(np.asarray(step, dtype=np.int64)),
     )
