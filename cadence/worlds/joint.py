@@ -1,0 +1,88 @@
+"""Episodes of several targets that behave together, and whether they met."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cadence.worlds.draws import Array
+from cadence.worlds.recordings import Int64s, Recordings
+
+MEETING_RADIUS_M = 600.0
+"""Agents that are so near to a site at one step are there together: four steps' way, a fifth of the distance of sites."""
+
+
+@dataclass(frozen=True, eq=False)
+class JointRecordings:
+    """E episodes of A agents each.
+
+    recordings     the agents one by one: those of episode e are its episodes e * A ... e * A + A - 1, all of one length
+    num_agents     A
+    is_meeting     [E] bool: the agents met at the site and went on together; otherwise each went straight to the goal
+    goal_m         [E, 2] float64 where all of them went
+    site_m         [E, 2] float64 the meeting site that was drawn; nobody made for it where `is_meeting` is false
+    left_site_step [E] int64 the step at which the group leaves the site; -1 where it never went there
+    """
+
+    recordings: Recordings
+    num_agents: int
+    is_meeting: NDArray[np.bool_]
+    goal_m: Array
+    site_m: Array
+    left_site_step: Int64s
+
+    def __post_init__(self) -> None:
+        count = len(self.is_meeting)
+        if self.num_agents < 1 or len(self.recordings) != count * self.num_agents:
+            raise ValueError(
+                f"JointRecordings: {len(self.recordings)} tracks are not {count} episodes of {self.num_agents} agents"
+            )
+        expected = {"is_meeting": (count,), "goal_m": (count, 2), "site_m": (count, 2), "left_site_step": (count,)}
+        for name, want in expected.items():
+            if getattr(self, name).shape != want:
+                raise ValueError(f"JointRecordings.{name} has shape {getattr(self, name).shape}, expected {want}")
+        length = self.recordings.length.reshape(count, self.num_agents)
+        if (length != length[:, :1]).any():
+            raise ValueError("JointRecordings: agents of one episode have tracks of different lengths")
+
+    def __len__(self) -> int:
+        return len(self.is_meeting)
+
+    @property
+    def length(self) -> Int64s:
+        """Steps of every episode [E]."""
+        return self.recordings.length[:: self.num_agents]
+
+    def track_m(self, episode: int) -> NDArray[np.float32]:
+        """Where the agents of one episode were [A, T, 2]."""
+        first, end = self.recordings.offset[[episode * self.num_agents, (episode + 1) * self.num_agents]]
+        return self.recordings.position_m[first:end].reshape(self.num_agents, -1, 2)
+
+    def select(self, episodes: Sequence[int] | Int64s | slice) -> "JointRecordings":
+        """Some of the episodes, in the order given."""
+        chosen = np.arange(len(self))[episodes]
+        tracks = chosen[:, None] * self.num_agents + np.arange(self.num_agents)
+        return JointRecordings(
+            self.recordings.select(tracks.ravel()),
+            self.num_agents,
+            self.is_meeting[chosen],
+            self.goal_m[chosen],
+            self.site_m[chosen],
+            self.left_site_step[chosen],
+        )
+
+
+def meets(position_m: NDArray[np.floating], sites_m: Array, radius_m: float = MEETING_RADIUS_M) -> NDArray[np.bool_]:
+    """Whether [...] the agents of tracks [..., A, T, 2] are all within `radius_m` of one of the sites [S, 2] at some step.
+
+    The same rule for truth and for samples. Agents that are NaN at a step are not asked; two at least must be there.
+    """
+    is_absent = np.isnan(position_m).any(axis=-1)
+    are_enough = (~is_absent).sum(axis=-2) >= 2
+    has_met = np.zeros(position_m.shape[:-3], dtype=bool)
+    for site in sites_m:
+        offset = position_m - site.astype(position_m.dtype)
+        is_near = (offset * offset).sum(axis=-1) <= radius_m**2
+        has_met |= ((is_near | is_absent).all(axis=-2) & are_enough).any(axis=-1)
+    return has_met
