@@ -1,0 +1,78 @@
+"""From a stream of detections to weighted ways to read it, at every window origin."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cadence.association.fitting import fit_habits
+from cadence.association.naming import named_like
+from cadence.association.particles import Particles, Stream, follow
+from cadence.association.presence import Habits
+from cadence.association.resampling import resample
+from cadence.association.types import CLUTTER, AssociationConfig, Associations
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+
+def associate(
+    time_s: Floats,
+    position_m: Floats,
+    covariance_m2: Floats,
+    origins_s: Floats,
+    config: AssociationConfig,
+    seed: int,
+    max_speed_mps: float | None = None,
+    habits: Habits | None = None,
+) -> list[Associations]:
+    """What the detections up to each origin may have come from.
+
+    Later detections revise what is said of earlier ones, never the other way round: but for `habits`, which belong to the log as
+    a whole as the fitted bank does, nothing after an origin influences its associations. An agent keeps its number from origin to
+    origin as long as it keeps most of its detections.
+
+    Args:
+        time_s: [N] in any order, seconds from any zero.
+        position_m: [N, 2].
+        covariance_m2: [N, 2, 2].
+        origins_s: [B] in any order; detections at an origin belong to it.
+        config: settings.
+        seed: of all random numbers.
+        max_speed_mps: a speed that no agent exceeds.
+        habits: how agents move and are detected; fitted to these detections where None.
+
+    Returns:
+        One for each origin, in the order of `origins_s`. Labels are those of the detections up to the origin in order of time
+        (a stable sort of `time_s`), so that they are the first ones of the sorted stream.
+    """
+    order = np.argsort(time_s, kind="stable")
+    stream = Stream(*(np.asarray(value, dtype=np.float64)[order] for value in (time_s, position_m, covariance_m2)))
+    habits = habits or fit_habits(stream, config, seed, max_speed_mps)
+    num_known = np.searchsorted(stream.time_s, origins_s, side="right")
+    readings = _readings(stream, habits, config, seed, set(num_known.tolist()))
+    num_agents = 1 + max((int(label.max(initial=CLUTTER)) for label, _ in readings.values()), default=CLUTTER)
+    num_agents = max(num_agents, config.num_agents or 0)
+    return [Associations(*readings[int(number)], num_agents) for number in num_known]
+
+
+def _readings(
+    stream: Stream, habits: Habits, config: AssociationConfig, seed: int, wanted: set[int]
+) -> dict[int, tuple[Integers, Floats]]:
+    """Named labels and weights after each wanted number of detections."""
+    out: dict[int, tuple[Integers, Floats]] = {}
+    reference = np.zeros(0, dtype=np.int64)
+    for number, particles in enumerate(follow(stream, habits, config.num_particles, seed)):
+        if number in wanted:
+            label, weight = _likeliest(particles, config.num_ways, np.random.default_rng([seed, number]).random())
+            label[0] = named_like(label[0], reference)
+            for way in range(1, len(label)):
+                label[way] = named_like(label[way], label[0])
+            out[number] = label, weight
+            reference = label[0]
+    return out
+
+
+def _likeliest(particles: Particles, num_ways: int, uniform: float) -> tuple[Integers, Floats]:
+    """Ways that stand for all particles, without bias, the likeliest first."""
+    index, weight = resample(particles.weight, num_ways, uniform)
+    order = np.argsort(-weight, kind="stable")
+    return particles.label[index[order]], weight[order]

@@ -1,0 +1,112 @@
+"""What is typical of a stream, found from its detections alone: scale of motion, ways to move, rates of detection (empirical Bayes).
+
+The likelihood of the stream under a small particle filter decides between scales; expectation maximisation over the filter's agents
+finds how often each way to move is met.
+"""
+
+import dataclasses
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cadence.association.motion import Modes
+from cadence.association.particles import Particles, Stream, follow
+from cadence.association.presence import Habits
+from cadence.association.types import CLUTTER, AssociationConfig
+
+Floats = NDArray[np.float64]
+
+_RELAXATIONS = (0.3, 1.0, 4.0, 16.0)
+_SPEEDS = (0.03, 0.2, 0.6)
+"""Ways to move in units of the mean time between two detections of an agent, and of the scale of speed."""
+_SWITCH_SHARE = 0.2
+_SCALES = 4.0 ** -np.arange(6.0)
+"""Scales of speed to try, in units of the stream's extent per mean time between two detections of an agent."""
+_NUM_AGENTS = (3, 10, 30)
+_NUM_PARTICLES = 16
+_MAX_DETECTIONS = 400
+_NUM_ROUNDS = 3
+_LEAST_SHARE = 0.02
+_PSEUDO_COUNT = 4.0
+_FLOOR = 1e-3
+_LEAST_CLUTTER = 1e-6
+
+
+def fit_habits(stream: Stream, config: AssociationConfig, seed: int, max_speed_mps: float | None = None) -> Habits:
+    """The habits of greatest likelihood for a stream; any sensible ones for a stream that says nothing."""
+    part = stream[:_MAX_DETECTIONS]
+    numbers = _NUM_AGENTS if config.num_agents is None else (config.num_agents,)
+    tried = [_first_habits(stream, config, number, scale, max_speed_mps) for number in numbers for scale in _SCALES]
+    if len(stream.time_s) < 2:
+        return tried[len(tried) // 2]
+    runs = [_run(part, habits, seed) for habits in tried]
+    best = int(np.argmax([run[0].log_evidence for run in runs]))
+    habits, run = tried[best], runs[best]
+    for _ in range(_NUM_ROUNDS):
+        habits = _improved(habits, *run, part)
+        run = _run(part, habits, seed)
+    return habits
+
+
+def _first_habits(
+    stream: Stream, config: AssociationConfig, num_agents: int, scale: float, max_speed_mps: float | None
+) -> Habits:
+    """Habits of a stream of so many agents that move at a scale of speed."""
+    num, sizes = max(len(stream.time_s), 1), np.ptp(stream.position_m, axis=0) if len(stream.time_s) else np.ones(2)
+    noise_m = math.sqrt(float(np.trace(stream.covariance_m2.mean(0)))) if len(stream.time_s) else 0.0
+    extent_m = max(float(np.hypot(*sizes)), noise_m, 1e-3)
+    span_s = max(float(np.ptp(stream.time_s)) if len(stream.time_s) else 1.0, 1e-3)
+    gap_s = span_s * num_agents / num
+    speed_mps = min(scale * extent_m / gap_s, max_speed_mps or math.inf)
+    pairs = [(relaxation * gap_s, speed * speed_mps) for relaxation in _RELAXATIONS for speed in _SPEEDS]
+    relaxation_s, speeds_mps = np.array(pairs).T
+    share = np.full(len(pairs), 1.0 / len(pairs))
+    is_known = config.num_agents is not None
+    return Habits(
+        modes=Modes(relaxation_s, speeds_mps, share, _SWITCH_SHARE),
+        rate_hz=1.0 / gap_s,
+        leave_hz=0.0 if is_known else 1.0 / span_s,
+        arrive_hz=0.0 if is_known else num_agents / span_s,
+        clutter_hz=max(config.clutter_share, _LEAST_CLUTTER) * num / span_s,
+        area_m2=float(np.prod(np.maximum(sizes, 0.1 * extent_m))),
+        floor_m=_FLOOR * speed_mps * gap_s,
+        num_agents=config.num_agents,
+        max_agents=config.max_agents,
+        max_speed_mps=max_speed_mps,
+    )
+
+
+def _run(stream: Stream, habits: Habits, seed: int) -> tuple[Particles, Floats]:
+    """The particles after the whole stream, and how much each mode was used [C]."""
+    usage = np.zeros(len(habits.modes))
+    switch, share = habits.modes.switch_share, habits.modes.share
+    for particles in follow(stream, habits, _NUM_PARTICLES, seed):
+        if particles.label.shape[1]:
+            agent = particles.label[:, -1]
+            rows = np.flatnonzero(agent != CLUTTER)
+            rows = rows[particles.tracks.count[rows, agent[rows]] > 1]
+            after = np.exp(particles.tracks.log_share[rows, agent[rows]])
+            before_switch = (after - switch * share) / (1.0 - switch)
+            usage += (particles.weight[rows, None] * before_switch).sum(0)
+    return particles, usage
+
+
+def _improved(habits: Habits, particles: Particles, usage: Floats, stream: Stream) -> Habits:
+    """Habits after one round: modes as often as they were used, rates as the likeliest way counts them."""
+    share = usage + _PSEUDO_COUNT / len(usage)
+    share = share / share.sum()
+    is_used = share >= _LEAST_SHARE
+    modes = habits.modes
+    modes = Modes(
+        modes.relaxation_s[is_used], modes.speed_mps[is_used], share[is_used] / share[is_used].sum(), modes.switch_share
+    )
+    best = int(particles.weight.argmax())
+    tracks = particles.tracks
+    num = int(tracks.num_agents[best])
+    watched_s = float((tracks.last_s - tracks.first_s)[best, :num].sum())
+    again = float(tracks.count[best, :num].sum() - num)
+    if habits.num_agents is not None or again < 1 or watched_s <= 0:
+        return dataclasses.replace(habits, modes=modes)
+    span_s = float(np.ptp(stream.time_s))
+    return dataclasses.replace(habits, modes=modes, rate_hz=again / watched_s, arrive_hz=num / span_s)

@@ -1,0 +1,34 @@
+"""Names of agents that hold over all ways to read a log and over all window origins.
+
+Every way numbers its agents as it meets them. Here they get the names of the agents of a way that was named before, matched by the
+detections that both give to them (the assignment of greatest overlap).
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
+
+from cadence.association.types import CLUTTER
+
+Integers = NDArray[np.int64]
+
+
+def named_like(label: Integers, reference: Integers) -> Integers:
+    """The labels [N] renamed after a reference [N'] for the first N' detections; agents without overlap get free names.
+
+    Free names are the smallest that no agent of this way has got, so that as few as possible are used in all.
+    """
+    num_own = int(label.max(initial=CLUTTER)) + 1
+    num_other = int(reference.max(initial=CLUTTER)) + 1
+    both = label[: len(reference)]
+    is_pair = (both != CLUTTER) & (reference != CLUTTER)
+    index = both[is_pair] * num_other + reference[is_pair]
+    overlap = np.bincount(index, minlength=num_own * num_other).reshape(num_own, num_other)
+    name = np.full(num_own + 1, CLUTTER)  # the last entry answers for clutter
+    rows, columns = linear_sum_assignment(-overlap)
+    is_match = overlap[rows, columns] > 0
+    name[rows[is_match]] = columns[is_match]
+    nameless = np.flatnonzero(name[:-1] == CLUTTER)
+    free = np.setdiff1d(np.arange(num_own + num_other), name)
+    name[nameless] = free[: len(nameless)]
+    return np.asarray(name[label], dtype=np.int64)

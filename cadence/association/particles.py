@@ -1,0 +1,112 @@
+"""The filter: many ways to read a stream side by side, each with its agents' Kalman filters.
+
+Rao-Blackwellised particle data association (Särkkä, Vehtari, Lampinen, "Rao-Blackwellized particle filter for multiple target tracking",
+2007). Every way is continued by every agent that may have caused the next detection, and of all continuations the best are kept and the
+others drawn from (`resampling`), which is the optimal importance distribution without its noise.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cadence.association.presence import Habits, log_hazards, log_silence_between
+from cadence.association.resampling import resample
+from cadence.association.tracks import Detection, Tracks, log_densities, updated
+from cadence.association.types import CLUTTER
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class Stream:
+    """N detections of unknown origin, oldest first.
+
+    time_s        [N] seconds, non-decreasing
+    position_m    [N, 2]
+    covariance_m2 [N, 2, 2] symmetric positive semi-definite
+    """
+
+    time_s: Floats
+    position_m: Floats
+    covariance_m2: Floats
+
+    def __post_init__(self) -> None:
+        n = len(self.time_s)
+        if self.time_s.shape != (n,) or self.position_m.shape != (n, 2) or self.covariance_m2.shape != (n, 2, 2):
+            shapes = [self.time_s.shape, self.position_m.shape, self.covariance_m2.shape]
+            raise ValueError(f"Stream: shapes {shapes}, expected [N], [N, 2] and [N, 2, 2]")
+        if np.any(np.diff(self.time_s) < 0):
+            raise ValueError("Stream.time_s must not decrease")
+
+    def __getitem__(self, detections: slice) -> "Stream":
+        """A stretch of the stream."""
+        return Stream(self.time_s[detections], self.position_m[detections], self.covariance_m2[detections])
+
+
+@dataclass(frozen=True, eq=False)
+class Particles:
+    """P ways to read the first N detections.
+
+    label         [P, N] agents in the order in which the way met them, -1 clutter
+    weight        [P] sums to one
+    tracks        what each way knows of its agents
+    log_evidence  log density of the detections so far
+    """
+
+    label: Integers
+    weight: Floats
+    tracks: Tracks
+    log_evidence: float
+
+
+def follow(stream: Stream, habits: Habits, num_particles: int, seed: int) -> Iterator[Particles]:
+    """The particles before the first detection and after each one: N + 1 times."""
+    generator = np.random.default_rng(seed)
+    particles = Particles(np.zeros((1, 0), dtype=np.int64), np.ones(1), Tracks.none(len(habits.modes)), 0.0)
+    yield particles
+    floor = habits.floor_m**2 * np.eye(2)
+    before_s = float(stream.time_s[0]) if len(stream.time_s) else 0.0
+    for time_s, position_m, covariance_m2 in zip(stream.time_s, stream.position_m, stream.covariance_m2, strict=True):
+        seen = Detection(float(time_s), position_m, covariance_m2 + floor)
+        particles = _next(particles, habits, seen, before_s, num_particles, float(generator.random()))
+        before_s = seen.time_s
+        yield particles
+
+
+def _next(
+    particles: Particles, habits: Habits, seen: Detection, before_s: float, num_particles: int, uniform: float
+) -> Particles:
+    """The particles after one more detection."""
+    tracks = particles.tracks
+    likelihood = continuations(tracks, habits, seen, before_s) + np.log(particles.weight)[:, None]
+    peak = float(likelihood.max())
+    weight = np.exp(likelihood - peak)
+    total = float(weight.sum())
+    flat, new_weight = resample(weight.ravel() / total, num_particles, uniform)
+    parent, column = np.divmod(flat, weight.shape[1])
+    num_slots = weight.shape[1] - 2
+    agent = np.where(column == num_slots, tracks.num_agents[parent], np.where(column > num_slots, CLUTTER, column))
+    label = np.concatenate([particles.label[parent], agent[:, None]], axis=1)
+    log_evidence = particles.log_evidence + peak + float(np.log(total))
+    return Particles(label, new_weight, updated(tracks[parent], habits.modes, seen, agent), log_evidence)
+
+
+def continuations(tracks: Tracks, habits: Habits, seen: Detection, before_s: float) -> Floats:
+    """Log density [P, A + 2] of the silence up to the detection and of the detection from each agent, a new one, or nobody."""
+    out = log_hazards(tracks, habits, seen.time_s) + log_silence_between(tracks, habits, before_s, seen.time_s)[:, None]
+    out[:, :-2] += log_densities(tracks, habits.modes, seen)
+    out[:, -2:] -= np.log(habits.area_m2)
+    if habits.max_speed_mps is not None:
+        out[:, :-2][is_too_fast(tracks, habits, seen)] = -np.inf
+    return out
+
+
+def is_too_fast(tracks: Tracks, habits: Habits, seen: Detection) -> NDArray[np.bool_]:
+    """Agents [P, A] that would have to exceed the speed limit by more than four standard deviations to be seen here."""
+    place = (np.exp(tracks.log_share)[..., None] * tracks.mean[..., :2]).sum(-2)
+    variance = tracks.covariance[..., 0, 0].max(-1) + tracks.covariance[..., 1, 1].max(-1) + np.trace(seen.covariance_m2)
+    way_m = np.sqrt(((seen.position_m - place) ** 2).sum(-1))
+    return np.asarray(way_m > (habits.max_speed_mps or np.inf) * (seen.time_s - tracks.last_s) + 4.0 * np.sqrt(variance))

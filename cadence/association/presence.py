@@ -1,0 +1,93 @@
+"""How often agents are detected, come and go: what is expected of the next detection before its position is looked at.
+
+An agent is detected at a rate of its own (a gamma law around the stream's rate, learned from its detections) until it leaves, after an
+exponential time. Neither is sampled: the chance that a silent agent has left is part of how unlikely its next detection is.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cadence.association.motion import Modes
+from cadence.association.tracks import Tracks
+
+Floats = NDArray[np.float64]
+
+_PRIOR_COUNT = 2.0
+"""How many detections' worth of evidence the stream's rate holds against an agent's own."""
+
+
+@dataclass(frozen=True, eq=False)
+class Habits:
+    """What is typical of a stream; `cadence.association.fitting` finds it.
+
+    modes          how agents move
+    rate_hz        detections of an agent per second
+    leave_hz       one over the mean time an agent stays; zero: all stay all through the log
+    arrive_hz      new agents detected per second, where the number of agents is unknown
+    clutter_hz     false detections per second
+    area_m2        where new agents and clutter are met, evenly
+    floor_m        no detection counts as more exact than this
+    num_agents     how many there are; None: unknown
+    max_agents     never more than this
+    max_speed_mps  an agent is never faster; None: no limit
+    """
+
+    modes: Modes
+    rate_hz: float
+    leave_hz: float
+    arrive_hz: float
+    clutter_hz: float
+    area_m2: float
+    floor_m: float
+    num_agents: int | None
+    max_agents: int
+    max_speed_mps: float | None
+
+
+def own_rate_hz(tracks: Tracks, habits: Habits) -> Floats:
+    """Expected rate of every agent's detections [P, A], as of its last one."""
+    watched_s = _PRIOR_COUNT / habits.rate_hz + tracks.last_s - tracks.first_s
+    return np.asarray((_PRIOR_COUNT + np.maximum(tracks.count - 1, 0)) / watched_s)
+
+
+def log_silence(rate_hz: Floats, leave_hz: float, silent_s: Floats) -> Floats:
+    """Log probability that an agent is not detected for so long after a detection: it left, or it stayed unseen."""
+    total = rate_hz + leave_hz
+    return np.asarray(np.log(leave_hz + rate_hz * np.exp(-total * silent_s)) - np.log(total))
+
+
+def log_silence_between(tracks: Tracks, habits: Habits, begin_s: float, end_s: float) -> Floats:
+    """Log probability that nobody was detected from `begin_s` to `end_s`, given the detections up to `begin_s` [P]."""
+    is_met = np.arange(tracks.last_s.shape[1]) < tracks.num_agents[:, None]
+    rate = own_rate_hz(tracks, habits)
+    silence = log_silence(rate, habits.leave_hz, end_s - tracks.last_s) - log_silence(
+        rate, habits.leave_hz, np.maximum(begin_s - tracks.last_s, 0.0)
+    )
+    return np.where(is_met, silence, 0.0).sum(1) - _new_hz(tracks, habits) * (end_s - begin_s)
+
+
+def log_hazards(tracks: Tracks, habits: Habits, time_s: float) -> Floats:
+    """Log rates [P, A + 2] at which the next detection comes: from each agent, a new one, or from nobody.
+
+    An agent that was detected at this very moment is not detected twice.
+    """
+    num_particles, num_slots = tracks.last_s.shape
+    rate = own_rate_hz(tracks, habits)
+    silent_s = time_s - tracks.last_s
+    stayed = np.log(rate) - (rate + habits.leave_hz) * silent_s - log_silence(rate, habits.leave_hz, silent_s)
+    slots = np.arange(num_slots)
+    hazards = np.empty((num_particles, num_slots + 2))
+    hazards[:, :-2] = np.where((slots < tracks.num_agents[:, None]) & (silent_s > 0), stayed, -np.inf)
+    with np.errstate(divide="ignore"):
+        hazards[:, -2] = np.log(_new_hz(tracks, habits))
+        hazards[:, -1] = np.log(habits.clutter_hz)
+    return hazards
+
+
+def _new_hz(tracks: Tracks, habits: Habits) -> Floats:
+    """Rate at which an agent is met for the first time [P]."""
+    if habits.num_agents is None:
+        return np.where(tracks.num_agents < habits.max_agents, habits.arrive_hz, 0.0)
+    return (habits.num_agents - tracks.num_agents) * habits.rate_hz
