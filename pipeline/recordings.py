@@ -35,11 +35,12 @@ FORMAT = 1
 
 @dataclass(frozen=True)
 class RecordingsConfig:
-    """Where single-target episodes come from.
+    """Where episodes come from.
 
     data           a folder of MCAP logs with truth, or an npz of `save_recordings`; without it the world is simulated
     pattern        which files of that folder, as a glob below it
-    world, set     what is simulated: "prison" with "low", "med" or "high", "narco" with "low" or "high"
+    world, set     what is simulated: "prison" with "low", "med" or "high", "narco" with "low" or "high", or "rendezvous",
+                   which has no sets
     first_index, num_episodes  of the simulated episodes; each depends on the seed and its index alone
     seed           of the simulation
     step_s         seconds between steps of logs; by default what each log states, or else what its truth has
@@ -51,7 +52,7 @@ class RecordingsConfig:
 
     data: Path | None = None
     pattern: str = "**/*.mcap"
-    world: Literal["prison", "narco"] = "prison"
+    world: Literal["prison", "narco", "rendezvous"] = "prison"
     set: Literal["low", "med", "high"] = "low"
     first_index: int = 0
     num_episodes: int = 50
@@ -67,6 +68,8 @@ class RecordingsConfig:
             raise ValueError("num_episodes must be at least 1, first_index and seed not negative")
         if (self.world, self.set) == ("narco", "med"):
             raise ValueError("the world 'narco' has the sets 'low' and 'high'")
+        if self.world == "rendezvous" and self.set != "low":
+            raise ValueError("the world 'rendezvous' has no sets; leave set as it is")
         if any(value is not None and not value > 0 for value in (self.step_s, self.scale_m)):
             raise ValueError("step_s and scale_m must be positive")
         if self.max_gap_steps < 1 or self.tolerance_m < 0:
@@ -77,8 +80,8 @@ class RecordingsConfig:
 class RecordingSet:
     """Episodes with what belongs to them.
 
-    names      of the episodes [E]
-    obstacles  of every episode [E]; the same object where they are the same
+    names      of the tracks [E]; agents of one episode are told apart by a suffix
+    obstacles  of every track [E]; the same object where they are the same
     scale_m    what the paper divides distances by; None where nothing states it
     left_out   one line for each log that could not be used
     """
@@ -91,7 +94,7 @@ class RecordingSet:
 
     def __post_init__(self) -> None:
         if not len(self.recordings) == len(self.names) == len(self.obstacles):
-            raise ValueError("RecordingSet: as many names and obstacles as episodes are needed")
+            raise ValueError("RecordingSet: as many names and obstacles as tracks are needed")
 
 
 def load_recordings(config: RecordingsConfig, cache: Path, progress: Progress) -> RecordingSet:
@@ -221,9 +224,11 @@ def _of_world(config: RecordingsConfig, cache: Path, progress: Progress) -> Reco
             first, last = max(begin, config.first_index), min(begin + BLOCK, stop)
             parts.append(_block(world, cache / "worlds", stem, begin, range(first, last)))
             bar.update(last - first)
-    names = tuple(f"{config.world}-{config.set}-{config.seed}-{i:04d}" for i in range(config.first_index, stop))
-    obstacles = (world.obstacles,) * config.num_episodes
-    return RecordingSet(Recordings.concatenate(parts), names, obstacles, config.scale_m or world.scale_m)
+    recordings = Recordings.concatenate(parts)
+    episodes = [f"{config.world}-{config.set}-{config.seed}-{i:04d}" for i in range(config.first_index, stop)]
+    agents = [f"-{agent}" for agent in range(recordings.num_agents)] if recordings.num_agents > 1 else [""]
+    names = tuple(episode + agent for episode in episodes for agent in agents)
+    return RecordingSet(recordings, names, (world.obstacles,) * len(names), config.scale_m or world.scale_m)
 
 
 def _world_stem(world: _World, config: RecordingsConfig) -> str:
@@ -248,6 +253,17 @@ def _block(world: _World, folder: Path, stem: str, begin: int, wanted: range) ->
 
 def _world(config: RecordingsConfig) -> _World:
     """The world that `config` names."""
+    if config.world == "rendezvous":
+        from cadence.worlds.rendezvous import RendezvousConfig, simulate_rendezvous, simulate_rendezvous_batch
+
+        rendezvous = RendezvousConfig()
+        terrain = simulate_rendezvous(rendezvous, config.seed, 0).terrain
+        return _World(
+            rendezvous,
+            lambda indices: simulate_rendezvous_batch(rendezvous, config.seed, indices).recordings,
+            as_obstacles(obstacles_as_json(terrain)),
+            terrain.side_m,
+        )
     if config.world == "prison":
         from cadence.worlds.prison import PrisonConfig, simulate_prison, simulate_prison_batch
 

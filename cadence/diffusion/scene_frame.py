@@ -38,9 +38,9 @@ class SceneConfig:
     num_gap, num_future  pieces from the last detection to now, and from now on
     stride       steps of a piece of the future
     few_steps    evaluations of the few-step sampler that the weights were tuned for; 0: they were not
-    shared_gap_steps  0: it is known whose a detection is, and an agent's track begins at its own last one. Else nobody knows, as
-                 in the paper's unknown origin: every agent is told all detections, and every track leads from the last of them
-                 to where its agent is now within so many steps
+    shared_gap_steps  0: it is known whose a detection is, and an agent's track begins at its own last one. Else nobody knows,
+                 as in the paper's unknown origin: every agent is told all detections, and every track leads from the last of
+                 them to where its agent is now within so many steps
     """
 
     network: SceneNetworkConfig = field(default_factory=SceneNetworkConfig)

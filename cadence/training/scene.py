@@ -166,8 +166,9 @@ def energy_loss(
     present = windows.is_real.float()
     at_knots = (_energy_score(track[:, :, knots], truth[:, knots]).mean(dim=1) * present).sum() / present.sum()
     size = 1 if windows.team is None else windows.team.num_agents
-    whole = (track * present[:, None, None, None]).unflatten(0, (-1, size)).transpose(1, 2).flatten(2)  # [B, K, A * P * 2]
-    true_whole = (truth * present[:, None, None]).unflatten(0, (-1, size)).flatten(1)
+    by_window = (track * present[:, None, None, None]).reshape(-1, size, *track.shape[1:])
+    whole = by_window.transpose(1, 2).flatten(2)  # [B, K, A * P * 2]
+    true_whole = (truth * present[:, None, None]).reshape(len(whole), -1)
     joint = _energy_score(whole[:, :, None], true_whole[:, None]).mean() / (size * clean.shape[1]) ** 0.5
     is_real = (inputs.pieces.span > 0).float() * present[:, None]
     local = (_energy_score(found, clean) * is_real).sum() / is_real.sum()

@@ -17,8 +17,7 @@ MEETING_RADIUS_M = 600.0
 class JointRecordings:
     """E episodes of A agents each.
 
-    recordings     the agents one by one: those of episode e are its episodes e * A ... e * A + A - 1, all of one length
-    num_agents     A
+    recordings     their tracks: those of episode e are its tracks e * A ... e * A + A - 1
     is_meeting     [E] bool: the agents met at the site and went on together; otherwise each went straight to the goal
     goal_m         [E, 2] float64 where all of them went
     site_m         [E, 2] float64 the meeting site that was drawn; nobody made for it where `is_meeting` is false
@@ -26,7 +25,6 @@ class JointRecordings:
     """
 
     recordings: Recordings
-    num_agents: int
     is_meeting: NDArray[np.bool_]
     goal_m: Array
     site_m: Array
@@ -34,20 +32,20 @@ class JointRecordings:
 
     def __post_init__(self) -> None:
         count = len(self.is_meeting)
-        if self.num_agents < 1 or len(self.recordings) != count * self.num_agents:
-            raise ValueError(
-                f"JointRecordings: {len(self.recordings)} tracks are not {count} episodes of {self.num_agents} agents"
-            )
+        if self.recordings.num_episodes != count:
+            raise ValueError(f"JointRecordings: {self.recordings.num_episodes} recorded episodes are not {count}")
         expected = {"is_meeting": (count,), "goal_m": (count, 2), "site_m": (count, 2), "left_site_step": (count,)}
         for name, want in expected.items():
             if getattr(self, name).shape != want:
                 raise ValueError(f"JointRecordings.{name} has shape {getattr(self, name).shape}, expected {want}")
-        length = self.recordings.length.reshape(count, self.num_agents)
-        if (length != length[:, :1]).any():
-            raise ValueError("JointRecordings: agents of one episode have tracks of different lengths")
 
     def __len__(self) -> int:
         return len(self.is_meeting)
+
+    @property
+    def num_agents(self) -> int:
+        """Agents A of every episode."""
+        return self.recordings.num_agents
 
     @property
     def length(self) -> Int64s:
@@ -62,10 +60,8 @@ class JointRecordings:
     def select(self, episodes: Sequence[int] | Int64s | slice) -> "JointRecordings":
         """Some of the episodes, in the order given."""
         chosen = np.arange(len(self))[episodes]
-        tracks = chosen[:, None] * self.num_agents + np.arange(self.num_agents)
         return JointRecordings(
-            self.recordings.select(tracks.ravel()),
-            self.num_agents,
+            self.recordings.select(chosen),
             self.is_meeting[chosen],
             self.goal_m[chosen],
             self.site_m[chosen],

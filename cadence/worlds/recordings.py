@@ -6,6 +6,7 @@ known, and the next positions are asked for; after the episode's end the target 
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -188,14 +189,19 @@ def cut_windows(
     rows, is_observed = _detection_rows(recordings, begin, now, has_start, num_detections)
     last = rows[np.arange(len(rows)), np.maximum(is_observed.sum(axis=1) - 1, 0)]
     place = recordings.position_m.astype(np.float64)
-    is_active = is_observed[:, 0].reshape(-1, agents)
+
+    def by_window(rows: NDArray[Any]) -> NDArray[Any]:
+        """Rows [B * A, ...] as [B, A, ...]."""
+        return rows.reshape(-1, agents, *rows.shape[1:])
+
+    is_active = np.take(by_window(is_observed), 0, axis=2)
     first = np.arange(len(step)) * agents + is_active.argmax(axis=1)
     datum = np.where(is_active.any(axis=1)[:, None], place[last[first]], 0.0)  # [B, 2]
     detections = Detections(
-        torch.from_numpy((rows - now[:, None]) * recordings.step_s).unflatten(0, (-1, agents)),
-        torch.from_numpy(place[rows]).unflatten(0, (-1, agents)) - torch.from_numpy(datum)[:, None, None],
+        torch.from_numpy(by_window((rows - now[:, None]) * recordings.step_s)),
+        torch.from_numpy(by_window(place[rows]) - datum[:, None, None]),
         (_SIGMA_M**2 * torch.eye(2, dtype=torch.float64)).expand(len(step), agents, rows.shape[1], 2, 2),
-        torch.from_numpy(is_observed).unflatten(0, (-1, agents)),
+        torch.from_numpy(by_window(is_observed)),
     )
     seeds = torch.from_numpy((seed * 1_000_003 + episode) * 10_007 + step)
     time_s = torch.arange(NUM_STEPS, dtype=torch.float64) * recordings.step_s
@@ -206,13 +212,13 @@ def cut_windows(
     context = Context(
         torch.from_numpy(datum),
         torch.from_numpy(step * recordings.step_s),
-        torch.from_numpy(recordings.known_goal_m[track]).double().unflatten(0, (-1, agents)),
+        torch.from_numpy(by_window(recordings.known_goal_m[track])).double(),
         torch.from_numpy(trackers),
     )
     return ForecastWindows(
         WindowBatch(time_s, detections, seeds, 0),
         context,
-        torch.from_numpy(place[later]).unflatten(0, (-1, agents)) - torch.from_numpy(datum)[:, None, None],
+        torch.from_numpy(by_window(place[later]) - datum[:, None, None]),
         torch.from_numpy(np.asarray(episode, dtype=np.int64)),
         torch.from_numpy(np.asarray(step, dtype=np.int64)),
     )

@@ -9,6 +9,7 @@ these episodes all take the same way then, side by side, in the others each its 
 when the last has. One step is a minute; the mission frame has its origin in the map's middle.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -220,7 +221,7 @@ def _seen(draws: Draws, row: int, rate: Array, num_steps: int) -> NDArray[np.boo
     return is_seen
 
 
-def simulate_rendezvous_batch(config: RendezvousConfig, seed: int, indices: NDArray[np.int64]) -> JointRecordings:
+def simulate_rendezvous_batch(config: RendezvousConfig, seed: int, indices: Sequence[int] | Indices) -> JointRecordings:
     """The episodes `indices` [E] of `seed`; each depends on nothing but its index, the seed and the settings.
 
     Positions are the true ones: noise and clutter exist in logs only.
@@ -237,10 +238,10 @@ def simulate_rendezvous_batch(config: RendezvousConfig, seed: int, indices: NDAr
         np.concatenate([roll.is_detected.ravel() for roll in rolls]),
         np.zeros((len(place), 0, 2), dtype=np.float32),
         np.full((len(length), 2), np.nan, dtype=np.float32),
+        config.num_agents,
     )
     return JointRecordings(
         recordings,
-        config.num_agents,
         plans.is_meeting,
         GOALS_M[plans.goal],
         SITES_M[plans.site],
