@@ -17,6 +17,8 @@ from cadence.worlds.narco import NarcoConfig, simulate_narco
 from cadence.worlds.patrol import PatrolConfig, simulate_patrol
 from cadence.worlds.prison import PrisonConfig, simulate_prison_episodes
 from cadence.worlds.prison_map import CELL_M
+from cadence.worlds.rendezvous import RendezvousConfig, simulate_rendezvous
+from cadence.worlds.rendezvous_map import GOALS_M, SITES_M
 from pipeline.config import config_as_dict
 from pipeline.logs.forms import Encoding
 from pipeline.logs.mission import MissionForm, write_mission
@@ -39,19 +41,20 @@ class SimulateConfig:
     """What to simulate, and how to write it.
 
     world           patrol: smugglers among islands, watched by boats, an aircraft and masts; prison and narco: the paper's
-                    worlds (Prison Escape, Smuggler), one target and many trackers
+                    worlds (Prison Escape, Smuggler), one target and many trackers; rendezvous: several agents who meet at a
+                    site and go on to a goal together, or go straight there
     seed            of the whole series of episodes
     num_episodes, first_index  episodes first_index ... first_index + num_episodes - 1 of `seed`; an episode depends on
                                nothing but its index, the seed and the settings below
     encoding        protobuf, json or cdr; protobuf logs in metres hold JSON detections (no Foxglove type has a covariance)
     georeferenced   positions as latitude and longitude
-    latitude_deg, longitude_deg  of the mission frame's origin, for georeferenced logs: the middle of the map in patrol, its
-                                 south-west corner in prison and narco
+    latitude_deg, longitude_deg  of the mission frame's origin, for georeferenced logs: the middle of the map in patrol and
+                                 rendezvous, its south-west corner in prison and narco
     frame_id        name of the frame in the messages
     start_time_s    Unix time of the first message
     """
 
-    world: Literal["patrol", "prison", "narco"] = "patrol"
+    world: Literal["patrol", "prison", "narco", "rendezvous"] = "patrol"
     num_episodes: int = 1
     seed: int = 0
     first_index: int = 0
@@ -64,6 +67,7 @@ class SimulateConfig:
     patrol: PatrolConfig = field(default_factory=PatrolConfig)
     prison: PrisonConfig = field(default_factory=PrisonConfig)
     narco: NarcoConfig = field(default_factory=NarcoConfig)
+    rendezvous: RendezvousConfig = field(default_factory=RendezvousConfig)
 
     def __post_init__(self) -> None:
         if self.num_episodes < 1:
@@ -76,14 +80,16 @@ class SimulateConfig:
     @property
     def stem(self) -> str:
         """What the names of the logs begin with."""
-        set_name = {"patrol": "", "prison": f"-{self.prison.set}", "narco": f"-{self.narco.set}"}[self.world]
+        set_name = {"prison": f"-{self.prison.set}", "narco": f"-{self.narco.set}"}.get(self.world, "")
         return f"{self.world}{set_name}-{self.seed}"
 
     def form(self) -> MissionForm:
         """How the episodes are written."""
         datum = (self.latitude_deg, self.longitude_deg) if self.georeferenced else (None, None)
         start_ns = self.start_time_s * 1_000_000_000
-        return MissionForm(self.encoding, Frame(self.frame_id, *datum), start_ns, groups_trackers=self.world != "patrol")
+        is_unknown = self.world == "rendezvous" and not self.rendezvous.is_origin_known
+        groups_trackers = self.world in ("prison", "narco")
+        return MissionForm(self.encoding, Frame(self.frame_id, *datum), start_ns, groups_trackers, names_agents=not is_unknown)
 
 
 @dataclass(frozen=True)
@@ -180,6 +186,8 @@ def _episodes(config: SimulateConfig, indices: Sequence[int]) -> Iterator[Episod
     for index in indices if config.world != "prison" else ():
         if config.world == "narco":
             yield simulate_narco(config.narco, config.seed, index)
+        elif config.world == "rendezvous":
+            yield simulate_rendezvous(config.rendezvous, config.seed, index)
         else:
             yield simulate_patrol(config.patrol, np.random.default_rng([config.seed, index]))
 
@@ -230,7 +238,20 @@ def _mission_record(episode: Episode, config: SimulateConfig, index: int) -> dic
         record |= {"latitude_deg": config.latitude_deg, "longitude_deg": config.longitude_deg}
     if config.world == "patrol":
         return record | {"detection_rate": config.patrol.detection_rate}
+    if config.world == "rendezvous":
+        return record | _rendezvous_record(episode, config.rendezvous)
     return record | _paper_record(episode, config)
+
+
+def _rendezvous_record(episode: Episode, config: RendezvousConfig) -> dict[str, Any]:
+    """What the logs of the world rendezvous say besides: an episode with a meeting has two goals, the first is the site."""
+    return {
+        "detection_rate": config.detection_rate,
+        "is_meeting": len(episode.goals_m[0]) == 2,
+        "is_origin_known": config.is_origin_known,
+        "all_goals_m": GOALS_M.tolist(),
+        "all_sites_m": SITES_M.tolist(),
+    }
 
 
 def _paper_record(episode: Episode, config: SimulateConfig) -> dict[str, Any]:

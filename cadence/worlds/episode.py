@@ -13,7 +13,7 @@ class SensorReports:
     """Detections of one episode, ordered by step, then agent, then sensor.
 
     step          [N] index into the episode's steps
-    agent, sensor [N] indices: which agent caused the detection, which sensor made it
+    agent, sensor [N] indices: which agent caused the detection (-1: none, clutter), which sensor made it (-1: none is told)
     position_m    [N, 2] measured position
     covariance_m2 [N, 2, 2] covariance of its noise
     """
@@ -68,7 +68,8 @@ class Episode:
     def is_detected(self) -> NDArray[np.bool_]:
         """Steps of each agent [A, T] that hold at least one detection."""
         seen = np.zeros(self.mode.shape, dtype=bool)
-        seen[self.detections.agent, self.detections.step] = True
+        is_caused = self.detections.agent >= 0
+        seen[self.detections.agent[is_caused], self.detections.step[is_caused]] = True
         return seen
 
 

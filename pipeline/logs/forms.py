@@ -182,8 +182,7 @@ def _json_detection_form() -> Form:
         "mission.Detection",
         {**words, "position": _object("xyz"), "position_covariance": _NUMBERS},
         lambda report: {
-            "agent_id": report.agent_id,
-            "sensor_id": report.sensor_id,
+            **{key: name for key, name in (("agent_id", report.agent_id), ("sensor_id", report.sensor_id)) if name},
             "position": {"x": report.x, "y": report.y, "z": 0.0},
             "position_covariance": _covariance9(report),
         },

@@ -1,14 +1,15 @@
 """A simulated episode as a mission log: truth, sensors, detections, obstacles to look at and obstacles to compute with.
 
 Topics: /truth/AGENT (positions), /sensors/SENSOR/pose (positions) or /trackers (all sensors that move in one message),
-/detections (messages that name agent and sensor) or /detections/AGENT (messages that have no field for the agent),
+/detections (messages that name agent and sensor, or do not know them) or /detections/AGENT (messages that have no field for the
+agent),
 /scene/obstacles (foxglove.SceneUpdate, protobuf always).
 Metadata records: `mission` (JSON values: how the log came about), `cadence.obstacles` (key `obstacles`: the list of
 obstacles.json, in the mission frame, whose datum stands beside it).
 """
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -30,6 +31,9 @@ SCENE_STEPS = 10
 """The obstacles' scene is repeated so often, but not more than once in so many steps where these are long: after a seek,
 viewers show only what they find near."""
 
+OBSTACLE_NAMES = {"prison": ("island", "mountain"), "rendezvous": ("massif", "peak")}
+"""What polygons and circles are called, by world; elsewhere islands and shoals."""
+
 LAND_RGBA = (0.62, 0.68, 0.5, 0.9)
 SHOAL_RGBA = (0.8, 0.72, 0.5, 0.9)
 
@@ -39,13 +43,15 @@ class MissionForm:
     """How an episode is written. The frame's datum is set for positions in latitude and longitude.
 
     With `groups_trackers` the sensors that move are one message a step, and those that do not are left to the Metadata
-    record; no message type has latitudes and longitudes of several, so geodetic logs write every sensor apart.
+    record; no message type has latitudes and longitudes of several, so geodetic logs write every sensor apart. Without
+    `names_agents` nothing tells which agent a detection is of.
     """
 
     encoding: Encoding
     frame: Frame
     start_ns: int
     groups_trackers: bool = False
+    names_agents: bool = True
 
     @property
     def is_geodetic(self) -> bool:
@@ -109,7 +115,7 @@ def _write_messages(writer: Writer, episode: Episode, form: MissionForm) -> None
     topics = _Topics(writer)
     scene_schema = writer.register_schema("foxglove.SceneUpdate", "protobuf", protobuf_schema(SceneUpdate))
     topics.open("/scene/obstacles", writer.register_channel("/scene/obstacles", "protobuf", scene_schema))
-    scene = _scene(episode.terrain, form.frame.frame_id, "mountain" if episode.world == "prison" else "shoal")
+    scene = _scene(episode.terrain, form.frame.frame_id, *OBSTACLE_NAMES.get(episode.world, ("island", "shoal")))
     poses, detections = pose_form(form.encoding, form.is_geodetic), detection_form(form.encoding, form.is_geodetic)
     truth, sensors = _place(episode.truth_m, form), _place(episode.sensors_m, form)
     measured, seen = _place(episode.detections.position_m, form), episode.detections
@@ -133,11 +139,18 @@ def _write_messages(writer: Writer, episode: Episode, form: MissionForm) -> None
             if moves[sensor] or is_slow_tick:
                 topics.write(f"/sensors/{name}/pose", poses, Report(time_ns, frame_id, *sensors[sensor, step].tolist()))
         for row in range(first[step], last[step]):
-            agent_id, sensor_id = episode.agent_ids[seen.agent[row]], episode.sensor_ids[seen.sensor[row]]
+            agent_id = _name(episode.agent_ids, int(seen.agent[row])) if form.names_agents else ""
+            sensor_id = _name(episode.sensor_ids, int(seen.sensor[row]))
             (xx, xy), (_, yy) = np.round(seen.covariance_m2[row], 3).tolist()
             x, y = measured[row].tolist()
             report = Report(time_ns, frame_id, x, y, (xx, xy, yy), agent_id, sensor_id)
-            topics.write("/detections" if detections.has_agent_id else f"/detections/{agent_id}", detections, report)
+            is_apart = agent_id and not detections.has_agent_id
+            topics.write(f"/detections/{agent_id}" if is_apart else "/detections", detections, report)
+
+
+def _name(names: Sequence[str], index: int) -> str:
+    """The name of that number; empty for -1, which is nobody."""
+    return names[index] if index >= 0 else ""
 
 
 def _place(position_m: np.ndarray[Any, np.dtype[np.float64]], form: MissionForm) -> np.ndarray[Any, np.dtype[np.float64]]:
@@ -148,11 +161,11 @@ def _place(position_m: np.ndarray[Any, np.dtype[np.float64]], form: MissionForm)
     return np.round(np.stack([longitude, latitude], axis=-1), 8).reshape(position_m.shape)
 
 
-def _scene(terrain: Terrain, frame_id: str, name_of_circles: str) -> SceneUpdate:
-    """Islands as triangles with an outline, circles as flat cylinders; one self-contained message."""
+def _scene(terrain: Terrain, frame_id: str, name_of_polygons: str, name_of_circles: str) -> SceneUpdate:
+    """Polygons as triangles with an outline, circles as flat cylinders; one self-contained message."""
     scene = SceneUpdate()
     for index, polygon in enumerate(terrain.polygons_m):
-        entity = scene.entities.add(id=f"island_{index + 1}", frame_id=frame_id)
+        entity = scene.entities.add(id=f"{name_of_polygons}_{index + 1}", frame_id=frame_id)
         land = entity.triangles.add()
         land.pose.orientation.w = 1.0
         land.color.r, land.color.g, land.color.b, land.color.a = LAND_RGBA
