@@ -19,9 +19,10 @@ from pipeline.export.playback import Scene, Tick, build_scenes, plan_ticks
 from pipeline.ingest import CATALOGUE_NAME, Catalogue, read_catalogue
 from pipeline.layouts import build_layout, build_legacy_layout
 from pipeline.logs.append import write_combined
+from pipeline.logs.recorder import Compression
 from pipeline.logs.scene import encode_scene
-from pipeline.logs.writer import Compression, LogWriter
-from pipeline.manifest import StageResult, manifest_path, read_manifest, run_stage
+from pipeline.logs.writer import LogWriter
+from pipeline.manifest import StageResult, hash_file, manifest_path, read_manifest, run_stage
 from pipeline.progress import Progress
 from pipeline.provenance import versions
 from pipeline.results import MissionHypotheses, read_hypothesis_tables
@@ -92,6 +93,8 @@ def export(directory: Path, config: ExportConfig, progress: Progress, force: boo
     Raises `InputError` where an earlier stage is missing or, for a combined file, where the source log is damaged.
     """
     catalogue = read_catalogue(directory)
+    if config.combined:
+        _check_combinable(catalogue)
     inputs = [directory / name for name in (CATALOGUE_NAME, *_TABLES, "obstacles.json")]
     inputs += [manifest_path(stage, directory) for stage in _EARLIER_STAGES if manifest_path(stage, directory).is_file()]
     inputs += [catalogue.path] if config.combined else []
@@ -100,6 +103,15 @@ def export(directory: Path, config: ExportConfig, progress: Progress, force: boo
         return _export(directory, work, catalogue, config, progress)
 
     return run_stage("export", directory, config=config, inputs=inputs, body=body, force=force)
+
+
+def _check_combinable(catalogue: Catalogue) -> None:
+    """Raise where a combined file would not hold the log as it was recorded; ingest has looked into every chunk."""
+    path, health = catalogue.path, catalogue.health
+    if not health.is_complete:
+        raise InputError(f"{path}: is damaged ({health.problems[0]}) and cannot be combined; export without combined")
+    if hash_file(path) != catalogue.sha256:
+        raise InputError(f"{path}: was changed after it was ingested and cannot be combined; run `cadence ingest` again")
 
 
 def _export(directory: Path, work: Path, catalogue: Catalogue, config: ExportConfig, progress: Progress) -> dict[str, Any]:

@@ -1,109 +1,107 @@
-"""A source log and our side file in one: every record of the source as it was, our messages among them by time."""
+"""A source log and our side file in one: the source's data as they are, byte for byte, our messages behind them.
 
-import contextlib
-import struct
-from collections.abc import Iterator
+Chunks, attachments and metadata of the source are not unpacked, let alone packed again. Our chunks overlap those of the
+source in time; readers that follow the index, and ours, put the messages of both in order.
+"""
+
+import os
+import zlib
 from pathlib import Path
-from typing import Any, BinaryIO
-
-import zstandard
-from mcap import records
-from mcap.exceptions import McapError
-from mcap.stream_reader import StreamReader
-from mcap.writer import Writer
+from typing import BinaryIO, Final
 
 from cadence.errors import InputError
-from pipeline.logs.writer import Compression, LogWriter
+from pipeline.logs.index import MAX_ID
+from pipeline.logs.reader import Channel, MissionLog, open_log
+from pipeline.logs.recorder import Compression, Recorder
+from pipeline.logs.records import DamagedRecord
+from pipeline.logs.source_index import SourceIndex, read_index
 from pipeline.progress import Progress
 
-_FOREIGN = (McapError, zstandard.ZstdError, RuntimeError, EOFError, MemoryError, ValueError, struct.error)
+_BLOCK_BYTES: Final = 2**20
 
 
 def write_combined(source: Path, side: Path, target: Path, compression: Compression, progress: Progress) -> None:
-    """Write `target` with all of `source` (messages, schemas, channels, attachments, metadata) and all of `side`.
+    """Write `target`: all bytes of `source` before the end of its data, then messages and metadata of `side`, one index.
 
-    Message bytes, times and sequence numbers are those of the source; ids and chunks are new. Neither input is touched.
+    Schemas and channels of `side` get ids above those of `source`. Memory is bounded by a chunk of either; `target` appears
+    when it is complete. Neither input is touched.
     Raises `InputError` where the source is damaged: a combined file must not hold less than its source.
     """
-    with source.open("rb") as source_file, side.open("rb") as side_file, progress.bar(None, "combine", "message") as bar:
-        ours = _records(side, side_file)
-        theirs = _records(source, source_file)
-        header = next(theirs, None)
-        profile = header.profile if isinstance(header, records.Header) else ""
-        with LogWriter(target, compression, profile) as writer:
-            added, copied = _Copier(side, writer.raw), _Copier(source, writer.raw)
-            waiting = added.next_message(ours)
-            for record in theirs:
-                if isinstance(record, records.Message):
-                    while waiting is not None and waiting.log_time < record.log_time:
-                        added.copy(waiting)
-                        waiting = added.next_message(ours)
-                    bar.update(1)
-                copied.copy(record)
-            while waiting is not None:
-                added.copy(waiting)
-                waiting = added.next_message(ours)
-
-
-class _Copier:
-    """Copies records of one log; its schemas and channels get new ids in the target."""
-
-    def __init__(self, path: Path, writer: Writer) -> None:
-        self._path = path
-        self._writer = writer
-        self._schema_ids = {0: 0}  # 0 means: no schema
-        self._channel_ids: dict[int, int] = {}
-
-    def next_message(self, found: Iterator[Any]) -> records.Message | None:
-        """The next message; whatever comes before it is copied."""
-        for record in found:
-            if isinstance(record, records.Message):
-                return record
-            self.copy(record)
-        return None
-
-    def copy(self, record: Any) -> None:
-        """Write one record; those of the summary are made anew by the writer."""
-        match record:
-            case records.Schema() if record.id not in self._schema_ids:
-                self._schema_ids[record.id] = self._writer.register_schema(record.name, record.encoding, record.data)
-            case records.Channel() if record.id not in self._channel_ids:
-                schema_id = self._known(self._schema_ids, record.schema_id)
-                self._channel_ids[record.id] = self._writer.register_channel(
-                    record.topic, record.message_encoding, schema_id, record.metadata
-                )
-            case records.Message():
-                self._writer.add_message(
-                    self._known(self._channel_ids, record.channel_id),
-                    record.log_time,
-                    record.data,
-                    record.publish_time,
-                    record.sequence,
-                )
-            case records.Attachment():
-                self._writer.add_attachment(record.create_time, record.log_time, record.name, record.media_type, record.data)
-            case records.Metadata():
-                self._writer.add_metadata(record.name, record.metadata)
-            case _:
-                pass
-
-    def _known(self, ids: dict[int, int], number: int) -> int:
-        if number not in ids:
-            raise InputError(f"{self._path}: is damaged (a channel or schema is missing); export without combined")
-        return ids[number]
-
-
-def _records(path: Path, file: BinaryIO) -> Iterator[Any]:
-    """Records in the order of the file, chunks unpacked and checked."""
-    with _as_input_error(path):
-        yield from StreamReader(file, validate_crcs=True).records
-
-
-@contextlib.contextmanager
-def _as_input_error(path: Path) -> Iterator[None]:
+    added = open_log(side)
+    if not added.health.is_complete:
+        raise InputError(f"{side}: is damaged ({'; '.join(added.health.problems)}); export again")
+    draft = target.with_name(f".{target.name}.{os.getpid()}")
     try:
-        yield
-    except _FOREIGN as error:
+        with source.open("rb") as source_file, draft.open("wb") as target_file:
+            found = _read_index(source, source_file, added)
+            checksum = _copy(source, source_file, target_file, found, progress)
+            recorder = Recorder(target_file, compression, found.index, found.data_end, checksum)
+            _add(added, recorder, progress)
+            recorder.finish()
+        os.replace(draft, target)
+    finally:
+        draft.unlink(missing_ok=True)
+
+
+def _read_index(source: Path, file: BinaryIO, added: MissionLog) -> SourceIndex:
+    """The index of the source, with room for the channels and schemas of `added`."""
+    try:
+        found = read_index(file, source.stat().st_size)
+    except DamagedRecord as error:
+        raise _damaged(source, str(error)) from error
+    num_schemas = len({_schema(channel) for channel in added.channels})
+    if found.index.max_channel_id + len(added.channels) > MAX_ID or found.index.max_schema_id + num_schemas > MAX_ID:
         raise InputError(
-            f"{path}: is damaged ({str(error) or type(error).__name__}) and cannot be combined; export without combined"
-        ) from error
+            f"{source}: uses ids of channels or schemas up to the largest, {MAX_ID}; none is left for ours; "
+            "export without combined"
+        )
+    return found
+
+
+def _damaged(source: Path, reason: str) -> InputError:
+    return InputError(f"{source}: is damaged ({reason}) and cannot be combined; export without combined")
+
+
+def _copy(source: Path, source_file: BinaryIO, target: BinaryIO, found: SourceIndex, progress: Progress) -> int | None:
+    """Copy the source up to the end of its data; the checksum of that, None where the source has none to compare with."""
+    source_file.seek(0)
+    checksum, position, buffer = 0, 0, memoryview(bytearray(_BLOCK_BYTES))
+    with progress.bar(found.data_end, f"combine {source.name}", unit="B", scale=True) as bar:
+        while position < found.data_end:
+            num_bytes = source_file.readinto(buffer[: found.data_end - position])  # type: ignore[attr-defined]
+            if not num_bytes:
+                raise _damaged(source, "it became shorter meanwhile")
+            block = buffer[:num_bytes]
+            target.write(block)
+            if found.checksum:
+                checksum = zlib.crc32(block, checksum)
+            position += num_bytes
+            bar.update(num_bytes)
+    if found.checksum != checksum:
+        raise _damaged(source, "the checksum over all data does not match")
+    return checksum if found.checksum else None
+
+
+def _add(added: MissionLog, recorder: Recorder, progress: Progress) -> None:
+    """Record all messages and metadata of `added`, its channels as far as they have messages."""
+    schemas: dict[tuple[str, str, bytes], int] = {("", "", b""): 0}
+    channels: dict[int, int] = {}
+    with progress.bar(added.size_bytes, f"combine {added.path.name}", unit="B", scale=True) as bar:
+        for message in added.messages(on_bytes=bar.update):
+            channel = message.channel
+            if channel.id not in channels:
+                schema = _schema(channel)
+                if schema not in schemas:
+                    schemas[schema] = recorder.add_schema(*schema)
+                channels[channel.id] = recorder.add_channel(
+                    channel.topic, channel.message_encoding, schemas[schema], channel.metadata
+                )
+            recorder.add_message(
+                channels[channel.id], message.sequence, message.log_time_ns, message.publish_time_ns, message.data
+            )
+    for name, content in added.metadata():
+        recorder.add_metadata(name, content)
+
+
+def _schema(channel: Channel) -> tuple[str, str, bytes]:
+    return channel.schema_name, channel.schema_encoding, channel.schema_data

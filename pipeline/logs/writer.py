@@ -3,7 +3,7 @@
 import functools
 from pathlib import Path
 from types import TracebackType
-from typing import Any, BinaryIO, Literal, Self
+from typing import Any, BinaryIO, Self
 
 import foxglove_schemas_protobuf.FrameTransform_pb2 as frame_transform
 import foxglove_schemas_protobuf.GeoJSON_pb2 as geojson
@@ -11,17 +11,13 @@ import foxglove_schemas_protobuf.Grid_pb2 as grid
 import foxglove_schemas_protobuf.LocationFix_pb2 as location_fix
 import foxglove_schemas_protobuf.SceneUpdate_pb2 as scene_update
 from google.protobuf import descriptor_pb2
-from mcap.writer import CompressionType, Writer
 
+from pipeline.logs.index import Index
+from pipeline.logs.recorder import Compression, Recorder
 from schemas.channels import DESCRIPTOR_PATH, Channel
-
-Compression = Literal["zstd", "lz4", "none"]
 
 LIBRARY = "cadence"
 """The writer's name in the header; no version, so that the bytes depend on the content only (versions: Metadata record)."""
-
-CHUNK_BYTES = 4 * 1024 * 1024
-"""Scene messages are some 100 kB and resemble their neighbours: a chunk must hold many for the compressor to see it."""
 
 _FOXGLOVE = {
     f"foxglove.{name}": getattr(module, name)
@@ -43,53 +39,52 @@ class LogWriter:
 
     def __init__(self, path: Path, compression: Compression = "zstd", profile: str = "", library: str = LIBRARY) -> None:
         self._path = path
-        self._compression = CompressionType[compression.upper()]
+        self._compression: Compression = compression
         self._header = (profile, library)
         self._channel_ids: dict[Channel, int] = {}
         self._schema_ids: dict[str, int] = {}
         self._sequences: dict[int, int] = {}
         self._file: BinaryIO | None = None
-        self._writer: Writer | None = None
+        self._recorder: Recorder | None = None
 
     def __enter__(self) -> Self:
         """Create the file."""
         self._file = self._path.open("wb")
-        self._writer = Writer(self._file, chunk_size=CHUNK_BYTES, compression=self._compression, enable_data_crcs=True)
-        self._writer.start(*self._header)
+        self._recorder = Recorder(self._file, self._compression, Index())
+        self._recorder.start(*self._header)
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
         """Finish the file, or leave the part that was written (its folder is temporary) where something failed."""
-        assert self._file is not None and self._writer is not None
+        assert self._file is not None
         try:
             if error is None:
-                self._writer.finish()  # type: ignore[no-untyped-call]
+                self._open.finish()
         finally:
             self._file.close()
 
     @property
-    def raw(self) -> Writer:
-        """The writer below, for records that are copied from another log."""
-        assert self._writer is not None, "use `with LogWriter(...)`"
-        return self._writer
+    def _open(self) -> Recorder:
+        assert self._recorder is not None, "use `with LogWriter(...)`"
+        return self._recorder
 
     def write(self, channel: Channel, time_ns: int, data: bytes) -> None:
         """Append one protobuf message with log time and publish time `time_ns`."""
         number = self._channel_ids.get(channel)
         if number is None:
-            number = self.raw.register_channel(channel.topic, "protobuf", self._schema_id(channel.message))
+            number = self._open.add_channel(channel.topic, "protobuf", self._schema_id(channel.message))
             self._channel_ids[channel] = number
         sequence = self._sequences.get(number, 0)
         self._sequences[number] = sequence + 1
-        self.raw.add_message(number, log_time=time_ns, data=data, publish_time=time_ns, sequence=sequence)
+        self._open.add_message(number, sequence, time_ns, time_ns, data)
 
     def metadata(self, name: str, content: dict[str, str]) -> None:
         """Append a Metadata record."""
-        self.raw.add_metadata(name, content)
+        self._open.add_metadata(name, content)
 
     def _schema_id(self, name: str) -> int:
         if name not in self._schema_ids:
-            self._schema_ids[name] = self.raw.register_schema(name, "protobuf", schema_bytes(name))
+            self._schema_ids[name] = self._open.add_schema(name, "protobuf", schema_bytes(name))
         return self._schema_ids[name]
 
 

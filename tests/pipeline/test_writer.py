@@ -108,7 +108,7 @@ def test_source_of_the_same_topic_stays_apart(tmp_path):
     assert len(content(target)[1]) == 12
 
 
-@pytest.mark.parametrize("keep", [0, 5, 60, 200, -40])
+@pytest.mark.parametrize("keep", [0, 5, 60, 200])
 def test_damaged_source_is_refused(tmp_path, keep):
     source, side = tmp_path / "source.mcap", tmp_path / "side.mcap"
     source_log(source)
