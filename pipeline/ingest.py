@@ -79,10 +79,10 @@ def ingest(log: Path, directory: Path, config: IngestConfig, progress: Progress,
 
     def body(work: Path) -> dict[str, Any]:
         catalogue = _survey(log, progress)
-        (work / CATALOGUE_NAME).write_text(json.dumps(_plain(catalogue), indent=1) + "\n", encoding="utf-8")
+        (work / CATALOGUE_NAME).write_text(json.dumps(_plain(catalogue, directory), indent=1) + "\n", encoding="utf-8")
         for problem in catalogue.health.problems:
             progress.note(f"{log.name}: {problem}")
-        return _summary(catalogue)
+        return _summary(catalogue, directory)
 
     if log.is_dir():
         open_log(log)  # says what is wrong; the stage would try to hash it
@@ -119,9 +119,10 @@ def read_catalogue(directory: Path) -> Catalogue:
             f"{path}: has version {version}, expected {CATALOGUE_VERSION}; run `cadence ingest` again with --force"
         )
     try:
-        return read_config(Catalogue, data, str(path))
+        catalogue = read_config(Catalogue, data, str(path))
     except ConfigError as error:
         raise InputError(f"{error}; run `cadence ingest` again with --force") from error
+    return dataclasses.replace(catalogue, path=directory.resolve() / catalogue.path)
 
 
 def open_catalogued_log(catalogue: Catalogue, on_bytes: Callable[[int], object] | None = None) -> MissionLog:
@@ -206,14 +207,20 @@ def _describe(channel: Channel, times: "array[int]", trial: tuple[str | None, st
     )
 
 
-def _plain(catalogue: Catalogue) -> dict[str, Any]:
-    return dataclasses.asdict(catalogue) | {"path": str(catalogue.path)}
+def _plain(catalogue: Catalogue, directory: Path) -> dict[str, Any]:
+    return dataclasses.asdict(catalogue) | {"path": _stated_path(catalogue.path, directory)}
 
 
-def _summary(catalogue: Catalogue) -> dict[str, Any]:
+def _stated_path(log: Path, directory: Path) -> str:
+    """Absolute; relative to the mission directory for a log in it (fetched from elsewhere): the two may move together."""
+    inside = directory.resolve()
+    return str(log.relative_to(inside) if log.is_relative_to(inside) else log)
+
+
+def _summary(catalogue: Catalogue, directory: Path) -> dict[str, Any]:
     undecodable = [channel.topic for channel in catalogue.channels if not channel.is_decodable and channel.num_messages]
     return {
-        "log": str(catalogue.path),
+        "log": _stated_path(catalogue.path, directory),
         "num_channels": len(catalogue.channels),
         "num_messages": catalogue.health.num_messages,
         "duration_s": catalogue.duration_s,
