@@ -4,7 +4,7 @@ import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -13,7 +13,7 @@ from pipeline.config import stage_config
 from pipeline.manifest import StageResult
 from pipeline.missions import mission_directories
 from pipeline.progress import Progress
-from pipeline.summaries import log_record, log_summary, stage_summary, to_json
+from pipeline.summaries import batch_summary, log_record, stage_summary, to_json
 
 EXIT_INTERRUPTED = 130
 
@@ -37,11 +37,23 @@ app = typer.Typer(
 )
 
 Log = Annotated[Path, typer.Argument(metavar="LOG", help="Mission log (MCAP).", show_default=False)]
-Logs = Annotated[list[Path], typer.Argument(metavar="LOG", help="Mission logs (MCAP).", show_default=False)]
+Logs = Annotated[
+    list[str],
+    typer.Argument(metavar="LOG", help="Mission logs (MCAP), folders or patterns of them.", show_default=False),
+]
 Mission = Annotated[
     Path, typer.Argument(metavar="MISSION", help="Mission directory, as written by ingest or run.", show_default=False)
 ]
 Out = Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the results; made where it is absent.")]
+RunOut = Annotated[str, typer.Option("--out", metavar="DIR", help="Folder for the results; made where it is absent.")]
+Workers = Annotated[
+    int | None, typer.Option(metavar="N", help="Processes; 0 works in this one; default: as cores and memory allow.")
+]
+Engine = Annotated[Literal["local"], typer.Option(help="Where the work is done.")]
+Start = Annotated[str | None, typer.Option(metavar="T", help="Use nothing before T: extract.start.")]
+End = Annotated[str | None, typer.Option(metavar="T", help="Use nothing after T: extract.end.")]
+Topic = Annotated[list[str] | None, typer.Option(metavar="PATTERN", help="Use only such topics: extract.topics; repeatable.")]
+Report = Annotated[Path | None, typer.Option(metavar="FILE", help="Write the outcome of every log as JSON there, too.")]
 Config = Annotated[
     Path | None, typer.Option("--config", metavar="FILE", help="TOML file with one table a stage (docs/configuration.md).")
 ]
@@ -86,30 +98,35 @@ def info(log: Log, as_json: Json = False) -> None:
 
 @app.command()
 def run(
-    logs: Logs, out: Out, config: Config = None, settings: Set = None, seed: Seed = None, force: Force = False,
-    quiet: Quiet = False, as_json: Json = False,
+    logs: Logs, out: RunOut, workers: Workers = None, engine: Engine = "local", start: Start = None, end: End = None,
+    topic: Topic = None, report: Report = None, config: Config = None, settings: Set = None, seed: Seed = None,
+    force: Force = False, quiet: Quiet = False, as_json: Json = False,
 ) -> int:  # fmt: skip
     """Run all stages on every log.
 
-    Ingest, extract, infer, export, report; finished stages are skipped. Each log gets the mission directory
-    DIR/<name of the log>. One bad log does not stop the others.
+    Ingest, extract, infer, export, report; finished stages are skipped. Folders are searched for logs, parts of a split
+    recording are one mission. Each gets the mission directory DIR/<its name>; what became of all is in DIR/batch.json.
+    One bad log does not stop the others; the exit code is the highest of the failures.
 
     \b
     Examples:
       cadence run flight.mcap --out results
-      cadence run logs/*.mcap --out results --config ships.toml --json
+      cadence run logs --out results --workers 4 --config ships.toml
+      cadence run 'logs/2026-*/*.mcap' --out results --report night.json --quiet
       cadence run flight.mcap --out results --set infer.num_hypotheses=50 --seed 7
     """
-    from pipeline.run import RunConfig, exit_code
+    from pipeline.batch import RunConfig, exit_code
     from pipeline.run import run as run_all
+    from pipeline.run import selection_settings
 
-    resolved = stage_config(RunConfig, None, config, settings or (), seed)
-    results = run_all(logs, out, resolved, Progress(quiet), force)
-    typer.echo(to_json([log_record(result) for result in results]) if as_json else log_summary(results))
-    for result in results:
-        if result.error is not None:
-            _complain(result.error)
-    return exit_code(results)
+    chosen = [*(settings or ()), *selection_settings(start, end, topic or ())]
+    resolved = stage_config(RunConfig, None, config, chosen, seed)
+    outcomes = run_all(logs, out, resolved, Progress(quiet), force, engine, workers, report)
+    typer.echo(to_json([log_record(outcome) for outcome in outcomes]) if as_json else batch_summary(outcomes))
+    for outcome in outcomes:
+        if outcome.exit_code:
+            _complain(outcome.message)
+    return exit_code(outcomes)
 
 
 @app.command()
@@ -286,7 +303,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return code if isinstance(code, int) else 0
 
 
-def _complain(error: CadenceError) -> None:
+def _complain(error: CadenceError | str) -> None:
     typer.echo(f"cadence: error: {' '.join(str(error).split())}", err=True)
 
 

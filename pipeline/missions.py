@@ -1,10 +1,43 @@
-"""Which mission directory belongs to which log."""
+"""Which logs are meant, which of them are one mission, and which mission directory belongs to which."""
 
+import glob
 import hashlib
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Final
 
-from cadence.errors import UsageError
+from cadence.errors import InputError, UsageError
+from pipeline.logs.parts import group_parts, mission_name
+
+_OWN_ENDINGS: Final = (".cadence.mcap", ".combined.mcap")
+
+
+@dataclass(frozen=True)
+class Mission:
+    """The parts of one mission in the order of the recording, its mission directory, and the size of all parts (0: unknown).
+
+    Parts and directory are paths or URLs.
+    """
+
+    parts: tuple[str, ...]
+    directory: str
+    size_bytes: int
+
+
+def find_missions(logs: Sequence[str], out: str) -> tuple[Mission, ...]:
+    """The missions among files, folders (searched through), patterns and URLs, each once, in the order given.
+
+    `UsageError` where nothing is given, `InputError` where a folder or a pattern holds no log.
+    """
+    if not logs:
+        raise UsageError("no log given; name at least one MCAP file")
+    groups = [tuple(map(str, group)) for group in group_parts([path for text in logs for path in _paths(text)])]
+    return tuple(
+        Mission(group, directory, sum(Path(part).stat().st_size for part in group if Path(part).is_file()))
+        for group, directory in zip(groups, _directories(groups, out), strict=True)
+    )
 
 
 def mission_directories(logs: Sequence[Path], out: Path) -> dict[Path, Path]:
@@ -16,15 +49,50 @@ def mission_directories(logs: Sequence[Path], out: Path) -> dict[Path, Path]:
     if not logs:
         raise UsageError("no log given; name at least one MCAP file")
     distinct = {log.resolve(): log for log in reversed(logs)}
-    stems = [log.stem for log in distinct]
-    directories = {}
-    for log in dict.fromkeys(log.resolve() for log in logs):
-        is_shared = stems.count(log.stem) > 1
-        suffix = "-" + hashlib.sha256(str(log).encode()).hexdigest()[:8] if is_shared else ""
-        directories[distinct[log]] = out / f"{log.stem}{suffix}"
-    return directories
+    groups = [(str(log),) for log in dict.fromkeys(log.resolve() for log in logs)]
+    return {distinct[Path(log)]: Path(found) for (log,), found in zip(groups, _directories(groups, str(out)), strict=True)}
 
 
 def is_mission_directory(path: Path) -> bool:
     """Whether a log was ingested into `path`, as opposed to a folder of mission directories."""
     return (path / "catalogue.json").is_file()
+
+
+def _paths(text: str) -> Iterator[Path]:
+    """The files that one argument means. A path that leads nowhere stays: its own failure will say so."""
+    path = Path(text)
+    if path.is_dir():
+        yield from _some(_logs_below(path), f"{text}: holds no MCAP log; name a log or another folder")
+    elif path.exists() or not glob.has_magic(text):
+        yield path
+    else:
+        found = [Path(name) for name in sorted(glob.glob(text, recursive=True))]  # noqa: PTH207 (Path.glob: no absolute ones)
+        logs = [log for each in found for log in (_logs_below(each) if each.is_dir() else [each] if _is_log(each) else [])]
+        yield from _some(logs, f"{text}: no MCAP log fits this pattern; correct it")
+
+
+def _some(logs: list[Path], otherwise: str) -> list[Path]:
+    if not logs:
+        raise InputError(otherwise)
+    return logs
+
+
+def _logs_below(folder: Path) -> list[Path]:
+    """All logs in `folder` and below it, by their paths; not what CADENCE wrote, and nothing hidden."""
+    return sorted(path for path in folder.rglob("*.mcap") if _is_log(path, folder))
+
+
+def _is_log(path: Path, folder: Path | None = None) -> bool:
+    inner = path.relative_to(folder).parts if folder is not None else (path.name,)
+    return path.is_file() and not path.name.endswith(_OWN_ENDINGS) and not any(part.startswith(".") for part in inner)
+
+
+def _directories(groups: Sequence[tuple[str, ...]], out: str) -> list[str]:
+    """`out`/<name of the mission>; where several share the name, with a hash of where the first part lies."""
+    names = [mission_name([Path(part) for part in group]) for group in groups]
+    counts = Counter(names)
+    found = []
+    for name, group in zip(names, groups, strict=True):
+        suffix = "-" + hashlib.sha256(str(Path(group[0]).resolve()).encode()).hexdigest()[:8] if counts[name] > 1 else ""
+        found.append(f"{out.rstrip('/') or '/'}/{name}{suffix}")
+    return found

@@ -1,10 +1,13 @@
 """Progress bars and notes on stderr; stdout is left to results."""
 
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 from tqdm import tqdm
+
+_MIN_SHARE = 0.01
 
 
 @dataclass(frozen=True)
@@ -28,3 +31,52 @@ class Progress:
     def warn(self, text: str) -> None:
         """What must be seen also where `quiet` was asked for: a failure that did not stop the rest."""
         tqdm.write(text, file=sys.stderr)
+
+    def part(self, begin: float, end: float) -> "Progress":
+        """The progress of work that takes a task from the share `begin` of it to the share `end`."""
+        return self
+
+
+Told = str | float
+"""What a task tells while it runs: a line of text, or the share of it that is done."""
+
+
+@dataclass(frozen=True)
+class RelayedProgress(Progress):
+    """Progress that is shown elsewhere: every note, and every bar as a share of the task, goes to `tell`."""
+
+    tell: Callable[[Told], object] = float
+    begin: float = 0.0
+    end: float = 1.0
+
+    def bar(self, total: int | None, label: str, unit: str = "it", scale: bool = False) -> "tqdm[Any]":
+        """A bar that is not drawn but told."""
+        return _ToldBar(total, lambda share: self.tell(self.begin + share * (self.end - self.begin)))
+
+    def note(self, text: str) -> None:
+        """Tell one line."""
+        self.tell(text)
+
+    def warn(self, text: str) -> None:
+        """Tell one line."""
+        self.tell(text)
+
+    def part(self, begin: float, end: float) -> "RelayedProgress":
+        """As above."""
+        return RelayedProgress(self.quiet, self.tell, begin, end)
+
+
+class _ToldBar(tqdm):  # type: ignore[type-arg]
+    """A bar without a picture, which tells its share at each per cent."""
+
+    def __init__(self, total: int | None, tell: Callable[[float], object]) -> None:
+        super().__init__(total=total, disable=True)
+        self._size, self._tell, self._done, self._told = total or 0, tell, 0.0, 0.0
+
+    def update(self, n: float | None = 1) -> bool | None:
+        self._done += n or 0
+        share = min(self._done / self._size, 1.0) if self._size else 0.0
+        if share - self._told >= _MIN_SHARE:
+            self._told = share
+            self._tell(share)
+        return None

@@ -1,85 +1,117 @@
-"""All stages for many logs: one bad log never stops the others, and what is done already is skipped."""
+"""`cadence run`: plan a batch, run it, report it. One bad log never stops the others, and what is done already is skipped."""
 
-import traceback
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+import contextlib
+import json
+import os
+import signal
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
+from types import FrameType
+from typing import Literal
 
-from cadence.errors import CadenceError
-from pipeline.export import ExportConfig, export
-from pipeline.extract import ExtractConfig, extract
-from pipeline.infer import InferConfig, infer
-from pipeline.ingest import IngestConfig, ingest
-from pipeline.manifest import StageResult
-from pipeline.missions import mission_directories
-from pipeline.progress import Progress
-from pipeline.report import ReportConfig, report
+from cadence.errors import UsageError
+from pipeline.batch import Engine, LogOutcome, LogTask, RunConfig, exit_code, plan_tasks, run_tasks
+from pipeline.engines.local import run_in_processes, run_in_sequence
+from pipeline.manifest import write_atomic
+from pipeline.progress import Progress, Told
+from pipeline.summaries import batch_record, to_json
 
+REPORT_NAME = "batch.json"
+_WORKER_BYTES = 2_000_000_000
+_MEMINFO = Path("/proc/meminfo")
 
-@dataclass(frozen=True)
-class RunConfig:
-    """The configuration of every stage of `cadence run`: the tables [ingest], [extract], [infer], [export], [report]."""
-
-    ingest: IngestConfig = field(default_factory=IngestConfig)
-    extract: ExtractConfig = field(default_factory=ExtractConfig)
-    infer: InferConfig = field(default_factory=InferConfig)
-    export: ExportConfig = field(default_factory=ExportConfig)
-    report: ReportConfig = field(default_factory=ReportConfig)
+EngineName = Literal["local"]
 
 
-@dataclass(frozen=True)
-class LogResult:
-    """What became of one log: the stages that finished and, where one did not, why.
+def run(
+    logs: Sequence[str], out: str, config: RunConfig, progress: Progress, force: bool = False,
+    engine: EngineName = "local", num_workers: int | None = None, report: Path | None = None,
+) -> tuple[LogOutcome, ...]:  # fmt: skip
+    """Run all stages on every mission among `logs`, each in its own mission directory under `out`; outcomes in their order.
 
-    directory  its mission directory
-    stages     results in the order of the pipeline, up to the first failure
-    error      the failure; `exit_code` 1 marks a defect of this program, whose traceback has been shown
+    Writes `out`/batch.json, and the same to `report`. `num_workers`: processes; 0 runs in this one; None chooses.
+    Raises `UsageError` or `InputError` where there is no log at all.
     """
-
-    log: Path
-    directory: Path
-    stages: tuple[StageResult, ...]
-    error: CadenceError | None = None
-
-
-def run(logs: Sequence[Path], out: Path, config: RunConfig, progress: Progress, force: bool = False) -> tuple[LogResult, ...]:
-    """Ingest, extract, infer, export and report every log into its own mission directory under `out`.
-
-    Failures stay with their log. `UsageError` where there is no log at all.
-    """
-    directories = mission_directories(logs, out)
-    results = []
-    for number, (log, directory) in enumerate(directories.items(), start=1):
-        progress.note(f"[{number}/{len(directories)}] {log} -> {directory}")
-        result = _run_log(log, directory, config, progress, force)
-        results.append(result)
-    return tuple(results)
+    started_s = time.monotonic()
+    tasks = plan_tasks(logs, out, config, force)
+    chosen = choose_engine(engine, len(tasks), num_workers)
+    with _interruptible(), contextlib.closing(_Shown(tasks, progress)) as shown:
+        outcomes = run_tasks(tasks, chosen, shown.finished, shown.watch)
+    text = to_json(batch_record(outcomes, exit_code(outcomes), time.monotonic() - started_s)) + "\n"
+    for path in [Path(out) / REPORT_NAME, *([report] if report is not None else [])]:
+        write_atomic(path, text)
+    return outcomes
 
 
-def exit_code(results: Sequence[LogResult]) -> int:
-    """0 where every log went through, else the highest code of the failures."""
-    return max((result.error.exit_code for result in results if result.error is not None), default=0)
+def selection_settings(start: str | None, end: str | None, topics: Sequence[str]) -> list[str]:
+    """The flags that select a part of a log, as overrides of the settings of `extract`."""
+    values = {"start": start, "end": end, "topics": list(topics) or None}
+    return [f"extract.{name}={json.dumps(value)}" for name, value in values.items() if value is not None]
 
 
-def _run_log(log: Path, directory: Path, config: RunConfig, progress: Progress, force: bool) -> LogResult:
-    steps: tuple[tuple[str, Callable[[], StageResult]], ...] = (
-        ("ingest", lambda: ingest(log, directory, config.ingest, progress, force)),
-        ("extract", lambda: extract(directory, config.extract, progress, force)),
-        ("infer", lambda: infer(directory, config.infer, progress, force)),
-        ("export", lambda: export(directory, config.export, progress, force)),
-        ("report", lambda: report(directory, config.report, progress, force)),
-    )
-    finished: list[StageResult] = []
-    for name, step in steps:
-        try:
-            finished.append(step())
-        except CadenceError as error:
-            return LogResult(log, directory, tuple(finished), error)
-        except Exception as error:  # a defect met by one log of a long batch must not cost the results of the others
-            progress.warn(traceback.format_exc())
-            defect = CadenceError(
-                f"{log}: defect in {name} ({type(error).__name__}: {error}); please report the traceback above"
-            )
-            return LogResult(log, directory, tuple(finished), defect)
-        progress.note(f"  {name}: {finished[-1].status}")
-    return LogResult(log, directory, tuple(finished))
+def choose_engine(name: EngineName, num_tasks: int, num_workers: int | None) -> Engine:
+    """The engine, with as many workers as there are tasks, cores and room in memory for, unless `num_workers` says it."""
+    if num_workers is not None and num_workers < 0:
+        raise UsageError(f"--workers {num_workers}: must not be negative")
+    if num_workers is None:
+        num_workers = 0 if num_tasks == 1 else max(1, min(len(os.sched_getaffinity(0)), _free_bytes() // _WORKER_BYTES))
+    return partial(run_in_processes, num_workers=num_workers) if num_workers else run_in_sequence
+
+
+class _Shown:
+    """A batch on stderr: one bar over the bytes of all logs, a line for each that is finished."""
+
+    def __init__(self, tasks: Sequence[LogTask], progress: Progress) -> None:
+        self._progress, self._num_tasks, self._num_finished = progress, len(tasks), 0
+        self._shares = {task.index: 0.0 for task in tasks}
+        self._bar = progress.bar(sum(task.size_bytes for task in tasks), "run", unit="B", scale=True)
+
+    def watch(self, task: LogTask, told: Told) -> None:
+        """A line of text, or how much of the task is done."""
+        if isinstance(told, str):
+            self._progress.note(told if self._num_tasks == 1 else f"{task.name}: {told}")
+        elif told > self._shares[task.index]:
+            self._bar.update((told - self._shares[task.index]) * task.size_bytes)
+            self._shares[task.index] = told
+
+    def finished(self, outcome: LogOutcome) -> None:
+        """The task is done with."""
+        self.watch(outcome.task, 1.0)
+        self._num_finished += 1
+        if outcome.trace:
+            self._progress.warn(outcome.trace)
+        counted = f"[{self._num_finished}/{self._num_tasks}]"
+        self._progress.note(f"{counted} {outcome.task.name}: {outcome.status} ({outcome.elapsed_s:.1f} s)")
+
+    def close(self) -> None:
+        """Take the bar away."""
+        self._bar.close()
+
+
+@contextlib.contextmanager
+def _interruptible() -> Iterator[None]:
+    """SIGTERM stops as Ctrl-C does: workers are stopped, what is half done is cleared away."""
+    if threading.current_thread() is not threading.main_thread():  # only there may handlers be set
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, _interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def _interrupt(number: int, frame: FrameType | None) -> None:
+    raise KeyboardInterrupt
+
+
+def _free_bytes() -> int:
+    """Memory that processes may still take; where the system does not tell, all there is."""
+    try:
+        line = next(line for line in _MEMINFO.read_text(encoding="utf-8").splitlines() if line.startswith("MemAvailable:"))
+    except (OSError, StopIteration):
+        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    return int(line.split()[1]) * 1024

@@ -2,16 +2,23 @@
 
 import dataclasses
 import json
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from pipeline.manifest import StageResult
 
 if TYPE_CHECKING:
-    from pipeline.run import LogResult
+    from pipeline.batch import LogOutcome
 
 SHOWN_STAGES = ("export", "report")
 """Whose files a person wants to open; the others are intermediate."""
+
+MAX_LOGS_WITH_FILES = 3
+"""With more logs than this the files of each are not listed."""
+
+BATCH_VERSION = 1
+"""Version of batch.json."""
 
 
 def to_json(value: Any) -> str:
@@ -39,20 +46,53 @@ def score_lines(scores: Sequence[Mapping[str, Any]]) -> list[str]:
     return ["  " + "  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in rows if scores]
 
 
-def log_record(result: "LogResult") -> dict[str, Any]:
-    """The result of one log of `cadence run` for `--json`."""
-    error = None if result.error is None else {"message": str(result.error), "exit_code": result.error.exit_code}
-    return {"log": str(result.log), "directory": str(result.directory), "stages": result.stages, "error": error}
+def log_record(outcome: "LogOutcome") -> dict[str, Any]:
+    """The outcome of one log of `cadence run` for programs."""
+    error = {"message": outcome.message, "exit_code": outcome.exit_code} if outcome.exit_code else None
+    task = outcome.task
+    return {
+        "log": task.parts[0], "parts": task.parts, "directory": task.directory, "status": outcome.status, "error": error,
+        "size_bytes": task.size_bytes, "elapsed_s": round(outcome.elapsed_s, 3), "stages": outcome.stages,
+    }  # fmt: skip
 
 
-def log_summary(results: Sequence["LogResult"]) -> str:
-    """One line for each log, and below it what was lost of a damaged one, and the files to look at."""
+def batch_record(outcomes: Sequence["LogOutcome"], exit_code: int, elapsed_s: float) -> dict[str, Any]:
+    """A batch for programs: batch.json."""
+    counts = Counter(outcome.status for outcome in outcomes)
+    return {
+        "version": BATCH_VERSION,
+        "exit_code": exit_code,
+        "elapsed_s": round(elapsed_s, 3),
+        "num_logs": len(outcomes),
+        **{f"num_{status}": counts[status] for status in ("done", "skipped", "partial", "failed")},
+        "logs": [log_record(outcome) for outcome in outcomes],
+    }
+
+
+def batch_summary(outcomes: Sequence["LogOutcome"]) -> str:
+    """A table with a row a log, what was lost of damaged ones, and the files to look at where they are few."""
+    numbers = ("num_windows", "num_agents", "num_detections")
+    rows = [("log", "status", "windows", "agents", "detections", "time", "")]
     lines = []
-    for result in results:
-        lines.append(f"{result.log}: {'ok' if result.error is None else 'failed'}")
-        lines += [f"  damaged: {problem}" for stage in result.stages for problem in stage.summary.get("problems", ())]
-        lines += [f"  {path}" for stage in result.stages if stage.stage in SHOWN_STAGES for path in stage.outputs]
-    return "\n".join(lines)
+    for outcome in outcomes:
+        summary = {name: value for stage in outcome.stages for name, value in stage.summary.items()}
+        cells = (str(summary.get(name, "-")) for name in numbers)
+        rows.append((outcome.task.name, outcome.status, *cells, f"{outcome.elapsed_s:.1f} s", outcome.message))
+        for stage in outcome.stages:
+            lines += [f"{outcome.task.name}: damaged: {problem}" for problem in stage.summary.get("problems", ())]
+            if stage.stage in SHOWN_STAGES and len(outcomes) <= MAX_LOGS_WITH_FILES:
+                lines += [f"  {path}" for path in stage.outputs]
+    return "\n".join([*_table(rows), *lines])
+
+
+def _table(rows: Sequence[Sequence[str]]) -> list[str]:
+    """Columns beside each other: the first two to the left, numbers to the right, the last as long as it is."""
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]) - 1)]
+    aligned = (
+        [cell.ljust(width) if i < 2 else cell.rjust(width) for i, (cell, width) in enumerate(zip(row, widths, strict=False))]
+        for row in rows
+    )
+    return ["  ".join([*cells, row[-1]]).rstrip() for cells, row in zip(aligned, rows, strict=True)]
 
 
 def _named(name: str, value: float) -> str:

@@ -1,0 +1,182 @@
+"""A batch as tasks: one mission each, that any process on any machine can run, and an outcome that can be sent back.
+
+Where tasks run is decided by an engine (`pipeline/engines`).
+"""
+
+import contextlib
+import time
+import traceback
+from collections.abc import Callable, Generator, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import torch
+
+from cadence.errors import CadenceError, DeviceError
+from pipeline.export import ExportConfig, export
+from pipeline.extract import ExtractConfig, extract
+from pipeline.infer import InferConfig, infer
+from pipeline.ingest import IngestConfig, ingest
+from pipeline.locks import locked
+from pipeline.manifest import StageResult
+from pipeline.missions import find_missions
+from pipeline.progress import Progress, Told
+from pipeline.report import ReportConfig, report
+
+Status = Literal["done", "skipped", "partial", "failed"]
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """The configuration of every stage of `cadence run`: the tables [ingest], [extract], [infer], [export], [report]."""
+
+    ingest: IngestConfig = field(default_factory=IngestConfig)
+    extract: ExtractConfig = field(default_factory=ExtractConfig)
+    infer: InferConfig = field(default_factory=InferConfig)
+    export: ExportConfig = field(default_factory=ExportConfig)
+    report: ReportConfig = field(default_factory=ReportConfig)
+
+
+@dataclass(frozen=True)
+class LogTask:
+    """One mission to be run.
+
+    index       its place in the order of the user
+    parts       its log, or the parts of a split one in the order of the recording: paths or URLs
+    directory   its mission directory: path or URL
+    size_bytes  of all parts; 0 where unknown
+    """
+
+    index: int
+    parts: tuple[str, ...]
+    directory: str
+    size_bytes: int
+    config: RunConfig
+    force: bool = False
+
+    @property
+    def name(self) -> str:
+        """What the mission is called: the last part of its directory."""
+        return self.directory.rstrip("/").rpartition("/")[2]
+
+
+@dataclass(frozen=True)
+class LogOutcome:
+    """What became of one log.
+
+    stages     results in the order of the pipeline, up to the first failure
+    message    why it failed, in one line; else empty
+    exit_code  of the failure: 1 marks a defect of this program, whose traceback is in `trace`; 0 where it went through
+    elapsed_s  how long it took
+    """
+
+    task: LogTask
+    stages: tuple[StageResult, ...] = ()
+    message: str = ""
+    exit_code: int = 0
+    elapsed_s: float = 0.0
+    trace: str = ""
+
+    @property
+    def status(self) -> Status:
+        """failed; partial: results rest on a damaged log; skipped: all was done before; done."""
+        if self.exit_code:
+            return "failed"
+        if any(stage.summary.get("is_complete") is False for stage in self.stages):
+            return "partial"
+        return "skipped" if all(stage.status == "skipped" for stage in self.stages) else "done"
+
+
+RunTask = Callable[[LogTask, Progress], LogOutcome]
+"""What an engine is given to run: `run_task`, or what stands in for it. It can be pickled and raises only for defects."""
+
+Watch = Callable[[LogTask, Told], None]
+"""Hears what tasks tell while they run; an engine that cannot hear its tasks need not call it."""
+
+Engine = Callable[[Sequence[LogTask], RunTask, Watch], Generator[LogOutcome, None, None]]
+"""Runs every task exactly once and gives the outcomes as they finish. A task whose worker dies has a failed outcome. Closing
+the generator early stops the workers."""
+
+
+def plan_tasks(logs: Sequence[str], out: str, config: RunConfig, force: bool = False) -> tuple[LogTask, ...]:
+    """One task for each mission among `logs`: files, folders, patterns or URLs, in their order. See `find_missions`."""
+    return tuple(
+        LogTask(index, mission.parts, mission.directory, mission.size_bytes, config, force)
+        for index, mission in enumerate(find_missions(logs, out))
+    )
+
+
+def run_task(task: LogTask, progress: Progress) -> LogOutcome:
+    """Ingest, extract, infer, export and report one mission. Failures are in the outcome, also defects."""
+    started_s = time.monotonic()
+    finished: list[StageResult] = []
+    message, code, trace = "", 0, ""
+    try:
+        # One thread: results depend on the number of threads, and must not depend on who else is running.
+        with _threads(1), locked(Path(task.directory), progress.note):
+            for number, (_, stage) in enumerate(_STAGES):
+                finished.append(stage(task, progress.part(number / len(_STAGES), (number + 1) / len(_STAGES))))
+    except CadenceError as error:
+        message, code = str(error), error.exit_code
+    except MemoryError:
+        message, code = f"{task.parts[0]}: out of memory; use fewer --workers", DeviceError.exit_code
+    except Exception as error:  # a defect met by one log of a long batch must not cost the results of the others
+        trace = traceback.format_exc()
+        stage_name = _STAGES[len(finished)][0] if len(finished) < len(_STAGES) else "run"
+        message = f"{task.parts[0]}: defect in {stage_name} ({type(error).__name__}: {error}); please report its traceback"
+        code = CadenceError.exit_code
+    return LogOutcome(task, tuple(finished), " ".join(message.split()), code, time.monotonic() - started_s, trace)
+
+
+def run_tasks(
+    tasks: Sequence[LogTask], engine: Engine, on_outcome: Callable[[LogOutcome], None], watch: Watch, run: RunTask = run_task
+) -> tuple[LogOutcome, ...]:
+    """Run all tasks, the longest first, and hear of each outcome as it comes; the outcomes in the order of the tasks."""
+    ordered = sorted(tasks, key=lambda task: -task.size_bytes)
+    outcomes: dict[int, LogOutcome] = {}
+    with contextlib.closing(engine(ordered, run, watch)) as finishing:
+        for outcome in finishing:
+            outcomes[outcome.task.index] = outcome
+            on_outcome(outcome)
+    return tuple(outcomes[task.index] for task in tasks)
+
+
+def exit_code(outcomes: Sequence[LogOutcome]) -> int:
+    """0 where every log went through, else the highest code of the failures."""
+    return max((outcome.exit_code for outcome in outcomes), default=0)
+
+
+@contextlib.contextmanager
+def _threads(count: int) -> Iterator[None]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def _ingest(task: LogTask, progress: Progress) -> StageResult:
+    return ingest(Path(task.parts[0]), Path(task.directory), task.config.ingest, progress, task.force)
+
+
+def _extract(task: LogTask, progress: Progress) -> StageResult:
+    return extract(Path(task.directory), task.config.extract, progress, task.force)
+
+
+def _infer(task: LogTask, progress: Progress) -> StageResult:
+    return infer(Path(task.directory), task.config.infer, progress, task.force)
+
+
+def _export(task: LogTask, progress: Progress) -> StageResult:
+    return export(Path(task.directory), task.config.export, progress, task.force)
+
+
+def _report(task: LogTask, progress: Progress) -> StageResult:
+    return report(Path(task.directory), task.config.report, progress, task.force)
+
+
+_STAGES: tuple[tuple[str, Callable[[LogTask, Progress], StageResult]], ...] = (
+    ("ingest", _ingest), ("extract", _extract), ("infer", _infer), ("export", _export), ("report", _report),
+)  # fmt: skip

@@ -1,0 +1,76 @@
+"""One process at a time in a folder. The kernel frees what a killed process held: nothing stale is ever left."""
+
+import contextlib
+import fcntl
+import os
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from cadence.errors import DeviceError
+
+_POLL_S = 0.1
+
+
+@contextlib.contextmanager
+def locked(folder: Path, on_wait: Callable[[str], None]) -> Iterator[None]:
+    """Hold `folder`, made where it is absent, alone among all processes; where it stays empty, it is removed again.
+
+    Waits while another process holds it, and says so once through `on_wait`. A file system that knows no locks is said
+    there too, and the work goes on. Raises `DeviceError` where the folder cannot be made.
+    """
+    handle = _hold(folder, on_wait)
+    try:
+        yield
+    finally:
+        with contextlib.suppress(OSError):  # the folder stays where it holds something
+            folder.rmdir()
+        os.close(handle)
+
+
+def is_held(folder: Path) -> bool:
+    """Whether a process holds `folder`, or may hold it where the file system knows no locks."""
+    try:
+        handle = os.open(folder, os.O_RDONLY)
+    except OSError:
+        return True
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        return True
+    finally:
+        os.close(handle)
+    return False
+
+
+def _hold(folder: Path, on_wait: Callable[[str], None]) -> int:
+    has_told = False
+    while True:
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            handle = os.open(folder, os.O_RDONLY)
+        except FileNotFoundError:  # removed by the one who had it before us
+            continue
+        except OSError as error:
+            raise DeviceError(f"{folder}: cannot write there ({error.strerror}); choose another folder with --out") from error
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if _is_same(folder, handle):
+                return handle
+        except BlockingIOError:
+            if not has_told:
+                on_wait(f"{folder}: another process works there; waiting for it")
+                has_told = True
+            time.sleep(_POLL_S)
+        except OSError as error:
+            on_wait(f"{folder}: cannot be locked ({error.strerror}); do not run two at a time on it")
+            return handle
+        os.close(handle)
+
+
+def _is_same(folder: Path, handle: int) -> bool:
+    """Whether the path still leads to what was locked."""
+    try:
+        return os.path.samestat(folder.stat(), os.fstat(handle))
+    except FileNotFoundError:
+        return False
