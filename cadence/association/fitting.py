@@ -17,12 +17,10 @@ from cadence.association.types import CLUTTER, AssociationConfig
 
 Floats = NDArray[np.float64]
 
-_RELAXATIONS = (0.3, 1.0, 4.0, 16.0)
-_SPEEDS = (0.03, 0.2, 0.6)
-"""Ways to move in units of the mean time between two detections of an agent, and of the scale of speed."""
+_RELAXATIONS = (0.3, 1.5, 8.0)
+_SPEEDS = tuple(3.0 ** -np.arange(8.0))
+"""Ways to move in units of the mean time between two detections of an agent, and of the stream's extent in that time."""
 _SWITCH_SHARE = 0.2
-_SCALES = 4.0 ** -np.arange(6.0)
-"""Scales of speed to try, in units of the stream's extent per mean time between two detections of an agent."""
 _NUM_AGENTS = (3, 10, 30)
 _NUM_PARTICLES = 16
 _MAX_DETECTIONS = 400
@@ -37,7 +35,7 @@ def fit_habits(stream: Stream, config: AssociationConfig, seed: int, max_speed_m
     """The habits of greatest likelihood for a stream; any sensible ones for a stream that says nothing."""
     part = stream[:_MAX_DETECTIONS]
     numbers = _NUM_AGENTS if config.num_agents is None else (config.num_agents,)
-    tried = [_first_habits(stream, config, number, scale, max_speed_mps) for number in numbers for scale in _SCALES]
+    tried = [_first_habits(stream, config, number, max_speed_mps) for number in numbers]
     if len(stream.time_s) < 2:
         return tried[len(tried) // 2]
     runs = [_run(part, habits, seed) for habits in tried]
@@ -49,17 +47,14 @@ def fit_habits(stream: Stream, config: AssociationConfig, seed: int, max_speed_m
     return habits
 
 
-def _first_habits(
-    stream: Stream, config: AssociationConfig, num_agents: int, scale: float, max_speed_mps: float | None
-) -> Habits:
-    """Habits of a stream of so many agents that move at a scale of speed."""
+def _first_habits(stream: Stream, config: AssociationConfig, num_agents: int, max_speed_mps: float | None) -> Habits:
+    """Habits of a stream of so many agents that may move in any way."""
     num, sizes = max(len(stream.time_s), 1), np.ptp(stream.position_m, axis=0) if len(stream.time_s) else np.ones(2)
     noise_m = math.sqrt(float(np.trace(stream.covariance_m2.mean(0)))) if len(stream.time_s) else 0.0
     extent_m = max(float(np.hypot(*sizes)), noise_m, 1e-3)
     span_s = max(float(np.ptp(stream.time_s)) if len(stream.time_s) else 1.0, 1e-3)
     gap_s = span_s * num_agents / num
-    speed_mps = min(scale * extent_m / gap_s, max_speed_mps or math.inf)
-    pairs = [(relaxation * gap_s, speed * speed_mps) for relaxation in _RELAXATIONS for speed in _SPEEDS]
+    pairs = [(relaxation * gap_s, speed * extent_m / gap_s) for relaxation in _RELAXATIONS for speed in _SPEEDS]
     relaxation_s, speeds_mps = np.array(pairs).T
     share = np.full(len(pairs), 1.0 / len(pairs))
     is_known = config.num_agents is not None
@@ -70,7 +65,7 @@ def _first_habits(
         arrive_hz=0.0 if is_known else num_agents / span_s,
         clutter_hz=max(config.clutter_share, _LEAST_CLUTTER) * num / span_s,
         area_m2=float(np.prod(np.maximum(sizes, 0.1 * extent_m))),
-        floor_m=_FLOOR * speed_mps * gap_s,
+        floor_m=1e-5 * extent_m,
         num_agents=config.num_agents,
         max_agents=config.max_agents,
         max_speed_mps=max_speed_mps,

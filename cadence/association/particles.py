@@ -19,6 +19,9 @@ from cadence.association.types import CLUTTER
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
+_NEGLIGIBLE = 1e-6
+"""Ways of less weight are given up even where there is room: a clear stretch of a stream needs few."""
+
 
 @dataclass(frozen=True, eq=False)
 class Stream:
@@ -85,7 +88,9 @@ def _next(
     peak = float(likelihood.max())
     weight = np.exp(likelihood - peak)
     total = float(weight.sum())
-    flat, new_weight = resample(weight.ravel() / total, num_particles, uniform)
+    share = weight.ravel() / total
+    share[share < _NEGLIGIBLE] = 0.0
+    flat, new_weight = resample(share, num_particles, uniform)
     parent, column = np.divmod(flat, weight.shape[1])
     num_slots = weight.shape[1] - 2
     agent = np.where(column == num_slots, tracks.num_agents[parent], np.where(column > num_slots, CLUTTER, column))
