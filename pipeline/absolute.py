@@ -30,6 +30,11 @@ def absolute_grid(config: AbsoluteConfig, stride_steps: int = 16) -> GridConfig:
     return GridConfig(config.step_s, config.history_steps, config.horizon_steps, stride_steps, context_steps)
 
 
+def absolute_context(windows: MissionWindows) -> Context:
+    """What a checkpoint is told of a mission: where its windows are."""
+    return Context(torch.from_numpy(windows.datum_m))
+
+
 def placed(model: AbsoluteModel, windows: MissionWindows, obstacles: Obstacles | None = None) -> AbsoluteModel:
     """The model for the windows of one mission."""
-    return model.placed(Context(torch.from_numpy(windows.datum_m)), obstacles)
+    return model.placed(absolute_context(windows), obstacles)

@@ -5,6 +5,7 @@ import pyarrow as pa
 import torch
 from torch import Tensor
 
+from pipeline.association import WayWindows
 from pipeline.windows import Grid, MissionWindows
 from schemas.tables import WINDOWS, hypotheses_schema
 
@@ -49,9 +50,7 @@ def hypothesis_rows(
 
 def window_rows(windows: MissionWindows, part: Tensor, position: Tensor, weight: Tensor, status: list[list[str]]) -> pa.Table:
     """WINDOWS rows of every agent."""
-    origin = position[:, :, :, windows.batch.origin_index]
-    mean = (weight[:, :, None, None] * origin).sum(1, keepdim=True)
-    spread = (weight[:, :, None] * ((origin - mean) ** 2).sum(-1)).sum(1).sqrt()
+    spread = _spread_m(position[:, :, :, windows.batch.origin_index], weight)
     detections = windows.batch.detections[part]
     age = -torch.where(detections.is_observed, detections.time_s, -torch.inf).amax(-1)
     rows = []
@@ -71,3 +70,23 @@ def window_rows(windows: MissionWindows, part: Tensor, position: Tensor, weight:
                 }
             )
     return pa.Table.from_pylist(rows, schema=WINDOWS)
+
+
+def with_association(rows: pa.Table, ways: WayWindows, part: Tensor) -> pa.Table:
+    """WINDOWS rows of some windows with what is said of agents whose detections are of unknown origin."""
+    window = part.numpy()
+    for name, value in (("probability", ways.probability), ("association_entropy_bits", ways.entropy_bits)):
+        index = WINDOWS.get_field_index(name)
+        rows = rows.set_column(index, WINDOWS.field(name), pa.array(value[window].reshape(-1), from_pandas=True))
+    return rows
+
+
+def _spread_m(position_m: Tensor, weight: Tensor) -> Tensor:
+    """Spread [B, A] of positions [B, K, A, 2] under weights [B, K]; hypotheses without the agent (NaN) are left out."""
+    is_there = position_m.isfinite().all(-1)
+    share = weight[:, :, None] * is_there
+    # An agent of every hypothesis keeps the weights as they are, to the last bit.
+    share = torch.where(is_there.all(1, keepdim=True), share, share / share.sum(1, keepdim=True))
+    position_m = torch.where(is_there[..., None], position_m, 0.0)
+    mean = (share[..., None] * position_m).sum(1, keepdim=True)
+    return (share * ((position_m - mean) ** 2).sum(-1)).sum(1).sqrt()

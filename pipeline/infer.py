@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -12,6 +12,7 @@ import pyarrow.compute as pc
 import torch
 from torch import Tensor
 
+from cadence.association.types import AssociationConfig
 from cadence.bank.bank import Bank
 from cadence.bank.hindsight import choose_by_hindsight
 from cadence.bank.rows import active_rows
@@ -23,18 +24,20 @@ from cadence.diffusion.general import GeneralModel
 from cadence.diffusion.scene import SceneSampling
 from cadence.errors import ConfigError, DeviceError
 from cadence.network.residual import ResidualNetwork, ResidualNetworkConfig
-from cadence.types import Context, Detections, WindowBatch
-from pipeline.absolute import absolute_grid, load_absolute
+from cadence.types import Context, Detections, HypothesisSet, WindowBatch
+from pipeline.absolute import absolute_context, absolute_grid, load_absolute
+from pipeline.association import Sources, WayWindows, build_way_windows, tell_sources
 from pipeline.checkpoints import DEFAULT, checkpoint_hash, find_checkpoint, load_weights, network_config, read_info
-from pipeline.hypothesis_tables import hypothesis_rows, window_rows
+from pipeline.hypothesis_tables import hypothesis_rows, window_rows, with_association
 from pipeline.ingest import CATALOGUE_NAME, read_catalogue
 from pipeline.manifest import StageResult, run_stage
 from pipeline.obstacles import read_obstacles
-from pipeline.placed_draws import draw_placed
+from pipeline.placed_draws import Forecaster, draw_placed
 from pipeline.progress import Progress
 from pipeline.scene import load_scene, scene_context, scene_grid
 from pipeline.tables import read_table, write_table
-from pipeline.windows import Grid, GridConfig, MissionWindows, build_windows, fit_tracks, later_detections, plan_grid
+from pipeline.way_draws import Drawn, draw_tracks, draw_ways
+from pipeline.windows import Grid, GridConfig, Int64s, MissionWindows, build_windows, fit_tracks, later_detections
 
 _ROWS_AT_ONCE = 48
 _HINDSIGHT_ROWS = 64
@@ -72,6 +75,8 @@ class InferConfig:
     paper            how a checkpoint of the paper preset is sampled; it brings its own grid
     scene            how a checkpoint of the scene preset is sampled; it brings its own grid
     is_gated         the network moves all, half or none of the hypotheses, as withheld detections of this log advise
+    is_associated    detections of unknown origin are told apart; otherwise they are taken for one agent called "unknown"
+    association      how they are told apart
     """
 
     num_hypotheses: int = 30
@@ -82,6 +87,8 @@ class InferConfig:
     default_sigma_m: float = 0.0
     device: str = "auto"
     is_gated: bool = True
+    is_associated: bool = True
+    association: AssociationConfig = field(default_factory=AssociationConfig)
     grid: GridConfig = field(default_factory=GridConfig)
     guidance: GuidanceConfig = field(default_factory=GuidanceConfig)
     paper: AbsoluteSampling = field(default_factory=AbsoluteSampling)
@@ -93,7 +100,10 @@ class InferConfig:
 
 
 def infer(directory: Path, config: InferConfig, progress: Progress, force: bool = False) -> StageResult:
-    """Draw hypotheses for every window of the mission in `directory`: hypotheses.parquet and windows.parquet."""
+    """Draw hypotheses for every window of the mission in `directory`: hypotheses.parquet and windows.parquet.
+
+    Where detections of unknown origin were told apart, associations.parquet holds how.
+    """
     weights = None if config.checkpoint == "none" else find_checkpoint(config.checkpoint)
     inputs = [directory / "detections.parquet", directory / "obstacles.json"]
     if weights is not None:
@@ -107,19 +117,23 @@ def infer(directory: Path, config: InferConfig, progress: Progress, force: bool 
         parts, statuses = [], []
         with progress.bar(plan.windows.batch.num_windows, "infer", unit="window") as bar:
             for part, positions, weight, status in plan.draws:
-                parts.append(hypothesis_rows(log_id, plan.windows, plan.grid, part, positions, weight))
-                statuses.append(window_rows(plan.windows, part, positions, weight, status))
+                parts.append(hypothesis_rows(log_id, plan.windows, plan.seen.sources.grid, part, positions, weight))
+                rows = window_rows(plan.windows, part, positions, weight, status)
+                statuses.append(rows if plan.seen.ways is None else with_association(rows, plan.seen.ways, part))
                 bar.update(len(part))
         tracks, windows = pa.concat_tables(parts), pa.concat_tables(statuses)
         write_table(tracks, folder / "hypotheses.parquet", "hypotheses", frame)
         write_table(windows, folder / "windows.parquet", "windows", frame)
+        if plan.seen.sources.association is not None:
+            found = plan.seen.sources.association.rows(detections)
+            write_table(found, folder / "associations.parquet", "associations", frame)
         counts = windows["status"].value_counts().to_pylist()
         return {
             "num_windows": plan.windows.batch.num_windows,
             "num_agents": len(plan.windows.agent_ids),
             "num_tracks": tracks.num_rows,
             "status": {str(item["values"]): int(item["counts"]) for item in counts},
-            "step_s": plan.grid.step_s,
+            "step_s": plan.seen.sources.grid.step_s,
             "checkpoint": config.checkpoint,
             "checkpoint_sha256": None if weights is None else checkpoint_hash(weights),
             "seed": config.seed,
@@ -130,13 +144,36 @@ def infer(directory: Path, config: InferConfig, progress: Progress, force: bool 
 
 
 @dataclass(frozen=True, eq=False)
+class _Seen:
+    """The windows, by name; `ways` where there are several ways to tell whose detections they hold."""
+
+    sources: Sources
+    named: MissionWindows
+    ways: WayWindows | None
+
+    @staticmethod
+    def of(config: InferConfig, detections: pa.Table, grid: GridConfig) -> "_Seen":
+        """The windows of a log on the grid that the model takes."""
+        sigma_m, association = config.default_sigma_m, config.association if config.is_associated else None
+        sources = tell_sources(detections, grid, association, config.seed, sigma_m, config.guidance.max_speed_mps)
+        named = build_windows(sources.named, sources.grid, config.seed, sigma_m)
+        is_told = sources.association is not None
+        ways = build_way_windows(detections, sources, config.seed, config.num_hypotheses, sigma_m) if is_told else None
+        return _Seen(sources, named, ways)
+
+
+@dataclass(frozen=True, eq=False)
 class _Plan:
     """What is to be drawn: the windows, the draws as they come, and what the summary says of the model."""
 
-    grid: Grid
-    windows: MissionWindows
-    draws: Iterator[tuple[Tensor, Tensor, Tensor, list[list[str]]]]
+    seen: _Seen
+    draws: Iterator[Drawn]
     about: dict[str, Any]
+
+    @property
+    def windows(self) -> MissionWindows:
+        """What the tables speak of."""
+        return self.seen.named if self.seen.ways is None else self.seen.ways.windows
 
 
 def _mission_start_ns(directory: Path, detections: pa.Table) -> int:
@@ -151,22 +188,53 @@ def _plan(config: InferConfig, detections: pa.Table, obstacles: Obstacles, weigh
     preset = None if weights is None else read_info(weights).preset
     if weights is not None and preset == "scene":
         scene = load_scene(weights, config.scene)
-        grid = plan_grid(detections, scene_grid(scene.config, config.grid.stride_steps))
-        windows = build_windows(detections, grid, config.seed, config.default_sigma_m)
+        seen = _Seen.of(config, detections, scene_grid(scene.config, config.grid.stride_steps))
         limits = Obstacles.none() if config.guidance.mode == "none" else obstacles
-        draws = draw_placed(scene, windows.batch, scene_context(windows, start_ns), config.num_hypotheses, limits)
-        return _Plan(grid, windows, draws, {"preset": "scene"})
+        draws = _placed_draws(scene, seen, lambda windows: scene_context(windows, start_ns), config.num_hypotheses, limits)
+        return _Plan(seen, draws, {"preset": "scene"} | _association_summary(seen))
     if weights is not None and preset == "paper":
         paper = load_absolute(weights, config.paper)
-        grid = plan_grid(detections, absolute_grid(paper.config, config.grid.stride_steps))
-        windows = build_windows(detections, grid, config.seed, config.default_sigma_m)
-        context = Context(torch.from_numpy(windows.datum_m))
-        draws = draw_placed(paper, windows.batch, context, config.num_hypotheses, obstacles)
-        return _Plan(grid, windows, draws, {"preset": "paper"})
-    grid = plan_grid(detections, config.grid)
-    windows = build_windows(detections, grid, config.seed, config.default_sigma_m)
-    model = fitted_model(config, detections, grid, windows, weights)
-    return _Plan(grid, windows, draw_hypotheses(model, windows, config, obstacles), _model_summary(model))
+        seen = _Seen.of(config, detections, absolute_grid(paper.config, config.grid.stride_steps))
+        draws = _placed_draws(paper, seen, absolute_context, config.num_hypotheses, obstacles)
+        return _Plan(seen, draws, {"preset": "paper"} | _association_summary(seen))
+    seen = _Seen.of(config, detections, config.grid)
+    model = fitted_model(config, seen.sources.named, seen.sources.grid, seen.named, weights)
+    if seen.ways is None:
+        draws = draw_hypotheses(model, seen.named, config, obstacles)
+    else:
+        draws = draw_tracks(seen.ways, lambda windows: draw_hypotheses(model, windows, config, obstacles))
+    return _Plan(seen, draws, _model_summary(model) | _association_summary(seen))
+
+
+def _placed_draws(
+    model: Forecaster,
+    seen: _Seen,
+    context_of: Callable[[MissionWindows], Context],
+    num_hypotheses: int,
+    obstacles: Obstacles,
+) -> Iterator[Drawn]:
+    if seen.ways is None:
+        return draw_placed(model, seen.named.batch, context_of(seen.named), num_hypotheses, obstacles)
+    context = context_of(seen.ways.windows)
+
+    def sample(batch: WindowBatch, window: Int64s, count: int) -> HypothesisSet:
+        return model.placed(context[torch.from_numpy(window)], obstacles).sample(batch, count)
+
+    return draw_ways(seen.ways, num_hypotheses, sample)
+
+
+def _association_summary(seen: _Seen) -> dict[str, Any]:
+    """What the summary says of detections of unknown origin; empty where there are none."""
+    association = seen.sources.association
+    if association is None:
+        return {}
+    return {
+        "association": {
+            "num_detections": len(association.stream),
+            "num_agents": len(association.agent_ids),
+            "mean_num_ways": sum(ways.num_ways for ways in association.ways) / len(association.ways),
+        }
+    }
 
 
 def load_model(config: InferConfig, weights: Path | None) -> GeneralModel:
@@ -224,9 +292,7 @@ def _hindsight_windows(
     return windows.batch[chosen], later[chosen]
 
 
-def draw_hypotheses(
-    model: GeneralModel, windows: MissionWindows, config: InferConfig, obstacles: Obstacles
-) -> Iterator[tuple[Tensor, Tensor, Tensor, list[list[str]]]]:
+def draw_hypotheses(model: GeneralModel, windows: MissionWindows, config: InferConfig, obstacles: Obstacles) -> Iterator[Drawn]:
     """Windows in chunks: their indices, positions [B', K, A, T, 2] about the datum, weights [B', K], status [B'][A]."""
     batch = windows.batch
     datum = torch.from_numpy(windows.datum_m)

@@ -22,7 +22,9 @@ class AgentHypotheses:
     """One agent in one window.
 
     datum_m     (x, y) in the mission frame
-    position_m  [K, T, 2] float32 metres relative to the datum; K is 0 where nothing could be drawn
+    position_m  [K, T, 2] float32 metres relative to the datum; K is 0 where nothing could be drawn; NaN in hypotheses
+                that the agent is no part of
+    probability, association_entropy_bits  of its being there, and of who caused its detections; None: their origin is known
     """
 
     agent_id: str
@@ -33,6 +35,8 @@ class AgentHypotheses:
     spread_m: float | None
     datum_m: tuple[float, float]
     position_m: Float32s
+    probability: float | None = None
+    association_entropy_bits: float | None = None
 
     @property
     def is_live(self) -> bool:
@@ -196,6 +200,8 @@ def _agent(row: dict[str, object], span: tuple[int, int] | None, rows: _Rows) ->
         spread_m=_optional_float(row["spread_m"]),
         datum_m=(float(datum[0]), float(datum[1])),
         position_m=rows.position_m[begin:end],
+        probability=_optional_float(row.get("probability")),
+        association_entropy_bits=_optional_float(row.get("association_entropy_bits")),
     )
 
 

@@ -20,7 +20,8 @@ from cadence.errors import ConfigError, InputError
 from cadence.types import Detections, WindowBatch
 
 UNKNOWN_AGENT = "unknown"
-"""Name of the one agent that detections of unknown origin are taken to belong to (association is not done here)."""
+"""Name of the one agent that detections of unknown origin are taken to belong to where they are not told apart
+(`pipeline.association` does that)."""
 
 _NICE = np.array([1.0, 1.2, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0])
 _STEPS_PER_GAP = 16.0
@@ -103,12 +104,19 @@ class MissionWindows:
 
 
 @dataclass(frozen=True, eq=False)
-class _AgentTrack:
-    """Detections of one agent, sorted by time."""
+class DetectionTrack:
+    """N detections of one agent, or of one stream, sorted by time: time_ns [N], position_m [N, 2], covariance_m2 [N, 2, 2]."""
 
     time_ns: Int64s
     position_m: Float64s
     covariance_m2: Float64s
+
+    def __getitem__(self, rows: slice | Int64s | npt.NDArray[np.bool_]) -> "DetectionTrack":
+        """A selection of the detections."""
+        return DetectionTrack(self.time_ns[rows], self.position_m[rows], self.covariance_m2[rows])
+
+    def __len__(self) -> int:
+        return len(self.time_ns)
 
 
 def plan_grid(detections: pa.Table, config: GridConfig) -> Grid:
@@ -150,7 +158,7 @@ def build_windows(detections: pa.Table, grid: Grid, seed: int, default_sigma_m: 
     Of the detections of one agent within one step only the first and the last are kept: they hold position and velocity.
     `default_sigma_m` is the accuracy of detections without covariance (the estimators add their own small floor).
     """
-    tracks = _kept_tracks(detections, grid, default_sigma_m)
+    tracks = kept_tracks(detections, grid, default_sigma_m)
     columns = _slice_tracks(tracks, grid.origins_ns, grid.origins_ns - grid.context_ns, grid.origins_ns)
     observed = columns.is_observed.numpy()
     count = observed.sum(axis=(1, 2))
@@ -162,12 +170,13 @@ def build_windows(detections: pa.Table, grid: Grid, seed: int, default_sigma_m: 
 def later_detections(detections: pa.Table, grid: Grid, windows: MissionWindows, default_sigma_m: float = 0.0) -> Detections:
     """What was detected after each window's origin and within its horizon, relative to origin and datum like the window."""
     end = grid.origins_ns + grid.horizon_steps * grid.step_ns
-    tracks = _kept_tracks(detections, grid, default_sigma_m)
+    tracks = kept_tracks(detections, grid, default_sigma_m)
     return _about(_slice_tracks(tracks, grid.origins_ns, grid.origins_ns, end), windows.datum_m)
 
 
-def _kept_tracks(detections: pa.Table, grid: Grid, default_sigma_m: float) -> dict[str, _AgentTrack]:
-    return {agent: _one_per_cell(track, grid) for agent, track in _agent_tracks(detections, default_sigma_m)}
+def kept_tracks(detections: pa.Table, grid: Grid, default_sigma_m: float) -> dict[str, DetectionTrack]:
+    """What windows are made of, by agent: of the detections within one step the first and the last."""
+    return {agent: _one_per_cell(track, grid) for agent, track in agent_tracks(detections, default_sigma_m)}
 
 
 def _about(detections: Detections, datum_m: Float64s) -> Detections:
@@ -177,7 +186,7 @@ def _about(detections: Detections, datum_m: Float64s) -> Detections:
     return Detections(detections.time_s, position, detections.covariance_m2, detections.is_observed)
 
 
-def _slice_tracks(tracks: dict[str, _AgentTrack], origins_ns: Int64s, start_ns: Int64s, end_ns: Int64s) -> Detections:
+def _slice_tracks(tracks: dict[str, DetectionTrack], origins_ns: Int64s, start_ns: Int64s, end_ns: Int64s) -> Detections:
     """Detections of each agent in (start, end] of each window, padded [B, A, N]; positions still in the mission frame."""
     spans = {
         agent: (np.searchsorted(t.time_ns, start_ns, "right"), np.searchsorted(t.time_ns, end_ns, "right"))
@@ -211,14 +220,14 @@ def fit_tracks(detections: pa.Table, grid: Grid, default_sigma_m: float = 0.0) -
     Times are seconds since the first detection of the stretch, positions metres relative to it.
     """
     length_ns = grid.context_ns
-    pieces: list[_AgentTrack] = []
-    for _, track in _agent_tracks(detections, default_sigma_m):
+    pieces: list[DetectionTrack] = []
+    for _, track in agent_tracks(detections, default_sigma_m):
         kept = _one_per_cell(track, grid)
         cell = (kept.time_ns - kept.time_ns[0]) // length_ns
         cuts = np.flatnonzero(np.diff(cell)) + 1
         bounds = [0, *cuts.tolist(), len(cell)]
         for begin, end in itertools.pairwise(bounds):
-            pieces.append(_AgentTrack(kept.time_ns[begin:end], kept.position_m[begin:end], kept.covariance_m2[begin:end]))
+            pieces.append(kept[begin:end])
     n = max(len(piece.time_ns) for piece in pieces)
     r = len(pieces)
     time_s, position = np.zeros((r, 1, n)), np.zeros((r, 1, n, 2))
@@ -239,7 +248,7 @@ def truth_on_grid(truth: pa.Table, windows: MissionWindows, max_gap_s: float) ->
     """
     step_times = windows.origins_ns[:, None] + np.round(windows.batch.time_s.numpy() * 1e9).astype(np.int64)
     position = np.full((*step_times.shape[:1], len(windows.agent_ids), step_times.shape[1], 2), np.nan)
-    tracks = dict(_agent_tracks(truth, 0.0))
+    tracks = dict(agent_tracks(truth, 0.0))
     for index, agent in enumerate(windows.agent_ids):
         if agent in tracks:
             track = tracks[agent]
@@ -255,28 +264,33 @@ def truth_on_grid(truth: pa.Table, windows: MissionWindows, max_gap_s: float) ->
 
 
 def _times_by_agent(table: pa.Table) -> list[Int64s]:
-    return [track.time_ns for _, track in _agent_tracks(table, 0.0)]
+    return [track.time_ns for _, track in agent_tracks(table, 0.0)]
 
 
-def _agent_tracks(table: pa.Table, default_sigma_m: float) -> Iterator[tuple[str, _AgentTrack]]:
+def agent_tracks(table: pa.Table, default_sigma_m: float) -> Iterator[tuple[str, DetectionTrack]]:
     """Agents in the order of their names, each sorted by time."""
     agent = pc.fill_null(table["agent_id"], UNKNOWN_AGENT)
     for name in sorted(pc.unique(agent).to_pylist()):
-        rows = table.filter(pc.equal(agent, name)).sort_by("time_ns")
-        position = np.stack([rows["x_m"].to_numpy(), rows["y_m"].to_numpy()], axis=-1)
-        covariance = np.zeros((len(position), 2, 2)) + default_sigma_m**2 * np.eye(2)
-        if "cov_xx_m2" in rows.column_names:
-            xx, xy, yy = (rows[f"cov_{axis}_m2"].to_numpy() for axis in ("xx", "xy", "yy"))
-            given = np.isfinite(xx.astype(np.float64)) & np.isfinite(yy.astype(np.float64))
-            stacked = np.stack([xx, np.nan_to_num(xy), np.nan_to_num(xy), yy], axis=-1).astype(np.float64).reshape(-1, 2, 2)
-            covariance[given] = stacked[given]
-        yield name, _AgentTrack(rows["time_ns"].to_numpy(), position, covariance)
+        yield name, track_of(table.filter(pc.equal(agent, name)).sort_by("time_ns"), default_sigma_m)
 
 
-def _one_per_cell(track: _AgentTrack, grid: Grid) -> _AgentTrack:
-    """The first and the last detection of every step cell."""
-    cell = (track.time_ns - grid.origins_ns[0]) // grid.step_ns
-    is_first = np.append(True, np.diff(cell) > 0)
-    is_last = np.append(np.diff(cell) > 0, True)
-    keep = is_first | is_last
-    return _AgentTrack(track.time_ns[keep], track.position_m[keep], track.covariance_m2[keep])
+def track_of(rows: pa.Table, default_sigma_m: float) -> DetectionTrack:
+    """All rows of a table that is sorted by time, whoever caused them."""
+    position = np.stack([rows["x_m"].to_numpy(), rows["y_m"].to_numpy()], axis=-1)
+    covariance = np.zeros((len(position), 2, 2)) + default_sigma_m**2 * np.eye(2)
+    if "cov_xx_m2" in rows.column_names:
+        xx, xy, yy = (rows[f"cov_{axis}_m2"].to_numpy() for axis in ("xx", "xy", "yy"))
+        given = np.isfinite(xx.astype(np.float64)) & np.isfinite(yy.astype(np.float64))
+        stacked = np.stack([xx, np.nan_to_num(xy), np.nan_to_num(xy), yy], axis=-1).astype(np.float64).reshape(-1, 2, 2)
+        covariance[given] = stacked[given]
+    return DetectionTrack(rows["time_ns"].to_numpy(), position, covariance)
+
+
+def _one_per_cell(track: DetectionTrack, grid: Grid) -> DetectionTrack:
+    return track[is_first_or_last(track.time_ns, grid)]
+
+
+def is_first_or_last(time_ns: Int64s, grid: Grid) -> npt.NDArray[np.bool_]:
+    """Which of one agent's detections [N], by time, are the first or the last of their step's cell."""
+    is_next = np.diff((time_ns - grid.origins_ns[0]) // grid.step_ns) > 0
+    return np.asarray(np.append(True, is_next) | np.append(is_next, True))

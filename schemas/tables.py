@@ -63,16 +63,34 @@ WINDOWS = pa.schema(
         pa.field("num_detections", pa.int32(), nullable=False),
         pa.field("age_s", pa.float64()),  # of the last detection at the origin; null without any
         pa.field("spread_m", pa.float64()),  # root mean square distance to the mean at the origin
+        pa.field("probability", pa.float64()),  # that the agent is there; null: the origin of its detections is known
+        pa.field("association_entropy_bits", pa.float64()),  # of who caused its detections; null as above
     ]
 )
 """One row per window and agent, also where no hypothesis could be drawn."""
+
+ASSOCIATIONS = pa.schema(
+    [
+        pa.field("log_id", pa.string(), nullable=False),
+        pa.field("time_ns", pa.int64(), nullable=False),
+        pa.field("topic", pa.string(), nullable=False),  # topic, log time and sequence as in DETECTIONS
+        pa.field("log_time_ns", pa.int64(), nullable=False),
+        pa.field("sequence", pa.int64(), nullable=False),
+        pa.field("agent_id", pa.string()),  # null = clutter
+        pa.field("first_window", pa.int32(), nullable=False),  # the first whose origin is not before the detection
+        pa.field("first_probability", pa.float64(), nullable=False),  # that the agent caused it, as known in that window
+        pa.field("probability", pa.float64(), nullable=False),  # the same as known in the last window
+    ]
+)
+"""One row per detection of unknown origin and agent that may have caused it; only for logs that have such detections."""
 
 
 def hypotheses_schema(num_steps: int) -> pa.Schema:
     """HYPOTHESES: one row per window, hypothesis and agent (only agents with status ok or infeasible).
 
     Step i lies at origin_ns + (i - origin_index) * step_ns; position_m is [T, 2] float32 relative to the datum
-    (datum_x_m, datum_y_m) in the mission frame. weight is that of the joint hypothesis: equal for all its agents.
+    (datum_x_m, datum_y_m) in the mission frame. weight is that of the joint hypothesis: equal for all its agents. Where
+    detections are of unknown origin, an agent need not be part of every hypothesis: NaN where it is not.
     """
     return pa.schema(
         [

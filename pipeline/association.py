@@ -1,0 +1,378 @@
+"""Detections of unknown origin: which agent caused which, in several ways, and windows of detections under each way.
+
+At a window origin there are many ways to read what was detected so far. Hypotheses are shared out among the ways by weight;
+under its way every hypothesis has detections of known origin and is drawn like any other.
+"""
+
+import itertools
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+import torch
+
+from cadence.association.associate import associate
+from cadence.association.fitting import fit_habits
+from cadence.association.particles import Stream
+from cadence.association.presence import Habits
+from cadence.association.types import CLUTTER, AssociationConfig, Associations, agent_probability
+from cadence.errors import InputError
+from cadence.types import Detections, WindowBatch
+from pipeline.windows import (
+    DetectionTrack,
+    Float64s,
+    Grid,
+    GridConfig,
+    Int64s,
+    MissionWindows,
+    is_first_or_last,
+    kept_tracks,
+    plan_grid,
+    track_of,
+    window_seeds,
+)
+from schemas.tables import ASSOCIATIONS
+
+_LEAST_PROBABILITY = 1e-3
+"""Rows of ASSOCIATIONS that are less likely at both times are left out."""
+
+_ROUGH_PARTICLES = 16
+
+
+@dataclass(frozen=True, eq=False)
+class Association:
+    """What the N detections of unknown origin of a log may have come from, as known at every window origin [B].
+
+    stream     the detections by time; row [N] where each stands in the DETECTIONS table
+    origins_ns [B]
+    ways       [B] labels of the detections up to the origin
+    agent_ids  names of the agents, by label
+    """
+
+    stream: DetectionTrack
+    row: Int64s
+    origins_ns: Int64s
+    ways: tuple[Associations, ...]
+    agent_ids: tuple[str, ...]
+
+    def named(self, detections: pa.Table) -> pa.Table:
+        """The table with the likeliest agents of the last origin as `agent_id`, without what is taken for clutter.
+
+        Raises `InputError` where nothing is left.
+        """
+        label = self.ways[-1].label[0]
+        names = np.array(detections["agent_id"].to_pylist(), dtype=object)
+        known = self.row[: len(label)]
+        names[known] = [self.agent_ids[agent] if agent != CLUTTER else None for agent in label]
+        column = detections.schema.get_field_index("agent_id")
+        named = detections.set_column(column, detections.schema.field("agent_id"), pa.array(names.tolist(), pa.string()))
+        found = named.filter(pa.array([name is not None for name in names]))
+        if found.num_rows == 0:
+            raise InputError("detections: all of them are taken for clutter; set infer.association.clutter_share = 0")
+        return found
+
+    def rows(self, detections: pa.Table) -> pa.Table:
+        """ASSOCIATIONS: how likely it is that each agent caused each detection, when it was first known of and in the end."""
+        last = agent_probability(self.ways[-1])
+        known_by = np.array([ways.num_detections for ways in self.ways])
+        found: dict[str, list[Any]] = {name: [] for name in ASSOCIATIONS.names}
+        first_window = np.searchsorted(known_by, np.arange(len(last)), side="right")
+        for window in np.unique(first_window).tolist():
+            at = np.flatnonzero(first_window == window)
+            then = agent_probability(self.ways[window])[at]
+            detection, agent = np.nonzero(np.maximum(then, last[at]) >= _LEAST_PROBABILITY)
+            rows = detections.take(pa.array(self.row[at[detection]]))
+            for name in ("log_id", "time_ns", "topic", "log_time_ns", "sequence"):
+                found[name] += rows[name].to_pylist()
+            found["agent_id"] += [self.agent_ids[a] if a < len(self.agent_ids) else None for a in agent]
+            found["first_window"] += [window] * len(at[detection])
+            found["first_probability"] += then[detection, agent].tolist()
+            found["probability"] += last[at][detection, agent].tolist()
+        return pa.Table.from_pydict(found, schema=ASSOCIATIONS)
+
+
+@dataclass(frozen=True, eq=False)
+class Sources:
+    """Where the detections come from: by name, as the settings of a model are fitted to them, and as known at each origin.
+
+    association is None where the origin of every detection is known (or nobody asked for more than one agent)
+    """
+
+    named: pa.Table
+    grid: Grid
+    association: Association | None
+
+
+def tell_sources(
+    detections: pa.Table,
+    grid: GridConfig,
+    config: AssociationConfig | None,
+    seed: int,
+    default_sigma_m: float = 0.0,
+    max_speed_mps: float | None = None,
+) -> Sources:
+    """Names for detections without one, and the grid, whose step follows from the gaps of single agents.
+
+    With `config` None the nameless are one agent, UNKNOWN_AGENT.
+    """
+    planned = plan_grid(detections, grid)
+    if config is None or detections["agent_id"].null_count == 0:
+        return Sources(detections, planned, None)
+    nameless = _Nameless.of(detections, default_sigma_m)
+    habits = fit_habits(nameless.stream, config, seed, max_speed_mps)
+    if grid.step_s is None:
+        # A few particles tell how long gaps are.
+        rough = replace(config, num_particles=min(config.num_particles, _ROUGH_PARTICLES), num_ways=1)
+        first = nameless.told_apart(planned.origins_ns[-1:], rough, seed, habits)
+        planned = plan_grid(first.named(detections), grid)
+    association = nameless.told_apart(planned.origins_ns, config, seed, habits)
+    return Sources(association.named(detections), planned, association)
+
+
+def associated(
+    detections: pa.Table,
+    origins_ns: Int64s,
+    config: AssociationConfig,
+    seed: int,
+    default_sigma_m: float = 0.0,
+    max_speed_mps: float | None = None,
+) -> Association:
+    """The detections without a name, told apart as far as they are known at each origin [B].
+
+    Detections with a name take no part: the nameless are agents beside those.
+    """
+    nameless = _Nameless.of(detections, default_sigma_m)
+    habits = fit_habits(nameless.stream, config, seed, max_speed_mps)
+    return nameless.told_apart(origins_ns, config, seed, habits)
+
+
+@dataclass(frozen=True, eq=False)
+class _Nameless:
+    """Detections of unknown origin by time, where they stand in their table [N], and the names that others have."""
+
+    track: DetectionTrack
+    row: Int64s
+    taken: frozenset[str]
+
+    @staticmethod
+    def of(detections: pa.Table, default_sigma_m: float) -> "_Nameless":
+        nameless = np.flatnonzero(detections["agent_id"].is_null().to_numpy())
+        row = nameless[np.argsort(detections["time_ns"].to_numpy()[nameless], kind="stable")]
+        taken = frozenset(name for name in detections["agent_id"].unique().to_pylist() if name is not None)
+        return _Nameless(track_of(detections.take(pa.array(row)), default_sigma_m), row, taken)
+
+    @property
+    def stream(self) -> Stream:
+        """Seconds since the first detection, metres about the middle of all."""
+        position_m = self.track.position_m - self.track.position_m.mean(axis=0)
+        return Stream(self._seconds(self.track.time_ns), position_m, self.track.covariance_m2)
+
+    def told_apart(self, origins_ns: Int64s, config: AssociationConfig, seed: int, habits: Habits) -> Association:
+        stream = self.stream
+        ways = associate(
+            stream.time_s, stream.position_m, stream.covariance_m2, self._seconds(origins_ns), config, seed, habits=habits
+        )
+        numbers = (number for number in itertools.count() if f"a{number}" not in self.taken)
+        agent_ids = tuple(f"a{number}" for number in itertools.islice(numbers, ways[-1].num_agents))
+        return Association(self.track, self.row, origins_ns, tuple(ways), agent_ids)
+
+    def _seconds(self, time_ns: Int64s) -> Float64s:
+        return np.asarray((time_ns - self.track.time_ns[0]) * 1e-9)
+
+
+@dataclass(frozen=True, eq=False)
+class _Reading:
+    """One window: the way of each hypothesis [K], and under each way used, the detections of every agent that has any.
+
+    probability [A] of each agent's being there; entropy_bits [A] of the origin of its detections in the window.
+    """
+
+    way: Int64s
+    tracks: tuple[dict[int, Int64s], ...]
+    probability: Float64s
+    entropy_bits: Float64s
+
+
+@dataclass(frozen=True, eq=False)
+class WayWindows:
+    """Windows of a mission whose detections can be read in several ways.
+
+    windows      every agent's detections under the likeliest way in which it has any: what tables say of them
+    probability, entropy_bits [B, A]  of each agent's being there, and of the origin of its detections; NaN: origin known
+    """
+
+    windows: MissionWindows
+    probability: Float64s
+    entropy_bits: Float64s
+    _readings: tuple[_Reading, ...]
+    _pool: DetectionTrack
+
+    def tracks(self, part: slice) -> tuple[MissionWindows, torch.Tensor]:
+        """Some windows [b] whose columns are all different tracks, and the column of each hypothesis and agent [b, K, A].
+
+        Columns are -1 where an agent is not there. An estimator that treats tracks apart draws every one of them once.
+        """
+        readings = self._readings[part]
+        num_agents = len(self.windows.agent_ids)
+        index: list[list[Int64s]] = []
+        column = np.full((len(readings), len(readings[0].way), num_agents), -1)
+        for b, reading in enumerate(readings):
+            place: dict[tuple[int, bytes], int] = {}
+            found: list[Int64s] = []
+            for way, tracks in enumerate(reading.tracks):
+                for agent, rows in tracks.items():
+                    key = (agent, rows.tobytes())
+                    if key not in place:
+                        place[key] = len(found)
+                        found.append(rows)
+                    column[b, reading.way == way, agent] = place[key]
+            index.append(found)
+        names = tuple(str(number) for number in range(max(1, *(len(found) for found in index))))
+        return self._laid_out(index, names, np.arange(len(self._readings))[part]), torch.from_numpy(column)
+
+    def ways(self, part: slice) -> tuple[MissionWindows, Int64s, Int64s]:
+        """Every way of some windows as a window of its own [E], whose window it is [E], and its number of hypotheses [E]."""
+        numbers = np.arange(len(self._readings))[part]
+        index, window, count = [], [], []
+        for b in numbers:
+            reading = self._readings[b]
+            for way, tracks in enumerate(reading.tracks):
+                index.append([tracks.get(agent, _NONE) for agent in range(len(self.windows.agent_ids))])
+                window.append(b)
+                count.append(int((reading.way == way).sum()))
+        chosen = np.array(window)
+        laid_out = self._laid_out(index, self.windows.agent_ids, chosen)
+        # windows that differ in their way alone must not share their random numbers
+        rank = np.arange(len(chosen)) - np.searchsorted(chosen, chosen)
+        seeds = (laid_out.batch.seeds + torch.from_numpy(rank) * 15_485_863) % 2**62
+        return replace(laid_out, batch=replace(laid_out.batch, seeds=seeds)), chosen, np.array(count)
+
+    def _laid_out(self, index: list[list[Int64s]], names: tuple[str, ...], window: Int64s) -> MissionWindows:
+        whole = self.windows
+        datum_m, origins_ns = whole.datum_m[window], whole.origins_ns[window]
+        detections = _padded(self._pool, index, len(names), origins_ns, datum_m)
+        batch = WindowBatch(
+            whole.batch.time_s, detections, whole.batch.seeds[torch.from_numpy(window)], whole.batch.origin_index
+        )
+        return MissionWindows(batch, origins_ns, whole.step_ns, names, datum_m)
+
+
+_NONE = np.zeros(0, dtype=np.int64)
+
+
+def build_way_windows(
+    detections: pa.Table, sources: Sources, seed: int, num_hypotheses: int, default_sigma_m: float = 0.0
+) -> WayWindows:
+    """The windows of a log with detections of unknown origin, `num_hypotheses` shared out among the ways of each."""
+    association, grid = sources.association, sources.grid
+    assert association is not None
+    named = detections.filter(detections["agent_id"].is_valid())
+    known = kept_tracks(named, grid, default_sigma_m)
+    agent_ids = tuple(sorted({*known, *association.agent_ids}))
+    builder = _Reader(association, grid, known, agent_ids)
+    seeds = window_seeds(seed, len(grid.origins_ns))
+    readings = tuple(builder.read(b, int(seeds[b]), num_hypotheses) for b in range(len(seeds)))
+    index = [[_first(reading, agent) for agent in range(len(agent_ids))] for reading in readings]
+    datum_m = np.stack([builder.pool.position_m[np.concatenate([*rows, _NONE])].sum(axis=0) for rows in index])
+    datum_m = datum_m / np.array([max(sum(map(len, rows)), 1) for rows in index])[:, None]
+    found = _padded(builder.pool, index, len(agent_ids), grid.origins_ns, datum_m)
+    batch = WindowBatch(grid.time_s, found, seeds, grid.origin_index)
+    windows = MissionWindows(batch, grid.origins_ns, grid.step_ns, agent_ids, datum_m)
+    probability, entropy = (np.stack([getattr(r, name) for r in readings]) for name in ("probability", "entropy_bits"))
+    return WayWindows(windows, probability, entropy, readings, builder.pool)
+
+
+def _first(reading: _Reading, agent: int) -> Int64s:
+    """The agent's detections under the likeliest way that has any."""
+    return next((tracks[agent] for tracks in reading.tracks if agent in tracks), _NONE)
+
+
+@dataclass(frozen=True, eq=False)
+class _Reader:
+    """Reads windows: detections of unknown origin by their ways, those of known origin alike in all of them."""
+
+    association: Association
+    grid: Grid
+    known: dict[str, DetectionTrack]
+    agent_ids: tuple[str, ...]
+
+    @cached_property
+    def pool(self) -> DetectionTrack:
+        """The stream, and after it the detections of the agents that the log names, in the order of `known`."""
+        parts = [self.association.stream, *self.known.values()]
+        columns = ("time_ns", "position_m", "covariance_m2")
+        return DetectionTrack(*(np.concatenate([getattr(part, name) for part in parts]) for name in columns))
+
+    @cached_property
+    def _column(self) -> Int64s:
+        """Column of each label."""
+        return np.array([self.agent_ids.index(name) for name in self.association.agent_ids], dtype=np.int64)
+
+    def read(self, b: int, seed: int, num_hypotheses: int) -> _Reading:
+        """The ways of window `b`."""
+        origin_ns = int(self.grid.origins_ns[b])
+        start_ns, ways = origin_ns - self.grid.context_ns, self.association.ways[b]
+        low = int(np.searchsorted(self.association.stream.time_ns[: ways.num_detections], start_ns, "right"))
+        label = ways.label[:, low:]
+        fixed = self._fixed(start_ns, origin_ns)
+        owner = shared_out(ways.weight, num_hypotheses, seed)
+        used, way = np.unique(owner, return_inverse=True)
+        tracks = tuple(fixed | self._tracks(label[number], low) for number in used)
+        probability, entropy = np.full((2, len(self.agent_ids)), np.nan)
+        is_there = np.stack([(label == agent).any(axis=1) for agent in range(len(self._column))], axis=-1)  # [M, A]
+        probability[self._column] = ways.weight @ is_there
+        entropy[self._column] = _entropy_bits(agent_probability(replace(ways, label=label)))
+        return _Reading(way, tracks, probability, entropy)
+
+    def _tracks(self, label: Int64s, low: int) -> dict[int, Int64s]:
+        """By agent: which detections of the stream are its under one way, the first and the last of every step."""
+        found = {}
+        for agent in np.unique(label[label != CLUTTER]).tolist():
+            rows = low + np.flatnonzero(label == agent)
+            found[int(self._column[agent])] = rows[is_first_or_last(self.association.stream.time_ns[rows], self.grid)]
+        return found
+
+    def _fixed(self, start_ns: int, origin_ns: int) -> dict[int, Int64s]:
+        found, begin = {}, len(self.association.stream)
+        for name, track in self.known.items():
+            first, last = np.searchsorted(track.time_ns, [start_ns, origin_ns], "right")
+            if first < last:
+                found[self.agent_ids.index(name)] = begin + np.arange(first, last)
+            begin += len(track)
+        return found
+
+
+def shared_out(weight: Float64s, num_hypotheses: int, seed: int) -> Int64s:
+    """The way of each hypothesis [K] by systematic resampling of the weights [M]: way m gets within one of K w_m of them."""
+    start = np.random.default_rng(seed).random()
+    points = (np.arange(num_hypotheses) + start) / num_hypotheses
+    last_used = int(np.flatnonzero(weight > 0)[-1])
+    return np.minimum(np.searchsorted(np.cumsum(weight), points), last_used)
+
+
+def _entropy_bits(probability: Float64s) -> Float64s:
+    """By agent [A], how open the origin of its detections is: the mean entropy of the rows of [N, A + 1], by its share."""
+    surprise = -np.log2(np.where(probability > 0, probability, 1.0))
+    share = probability[:, :-1]
+    total = share.sum(axis=0)
+    bits = share.T @ (probability * surprise).sum(axis=1)
+    return np.where(total > 0, bits / np.where(total > 0, total, 1.0), np.nan)
+
+
+def _padded(
+    pool: DetectionTrack, index: list[list[Int64s]], num_columns: int, origins_ns: Int64s, datum_m: Float64s
+) -> Detections:
+    """Detections of the pool laid out as [R, C, N], about each row's origin and datum."""
+    num = max((len(rows) for columns in index for rows in columns), default=1)
+    pick = np.full((len(index), num_columns, max(num, 1)), -1)
+    for r, columns in enumerate(index):
+        for c, rows in enumerate(columns):
+            pick[r, c, : len(rows)] = rows
+    is_observed: npt.NDArray[np.bool_] = pick >= 0
+    time_s = np.where(is_observed, (pool.time_ns[pick] - origins_ns[:, None, None]) * 1e-9, 0.0)
+    position_m = np.where(is_observed[..., None], pool.position_m[pick] - datum_m[:, None, None], 0.0)
+    covariance_m2 = np.where(is_observed[..., None, None], pool.covariance_m2[pick], np.eye(2))
+    return Detections(*(torch.from_numpy(value) for value in (time_s, position_m, covariance_m2, is_observed)))

@@ -1,0 +1,215 @@
+"""Detections of unknown origin through infer: ways to read them, hypotheses under each way, tables, known beside unknown."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pytest
+import torch
+
+from cadence.association.types import AssociationConfig, Associations
+from cadence.errors import InputError
+from cadence.types import HypothesisSet, WindowBatch
+from pipeline import association
+from pipeline.association import WayWindows, build_way_windows, shared_out, tell_sources
+from pipeline.infer import InferConfig, infer
+from pipeline.progress import Progress
+from pipeline.results import read_hypothesis_tables
+from pipeline.tables import Frame, read_table, write_table
+from pipeline.way_draws import draw_ways
+from pipeline.windows import UNKNOWN_AGENT, GridConfig
+from schemas.tables import ASSOCIATIONS, DETECTIONS
+
+QUIET = Progress(quiet=True)
+START_NS = 1_700_000_000_000_000_000
+GRID = GridConfig(step_s=2.0, history_steps=16, horizon_steps=8, stride_steps=16)
+CONFIG = InferConfig(num_hypotheses=8, checkpoint="none", device="cpu", grid=GRID)
+TIMES_S = np.array([0, 3, 6, 9, 12, 15, 18, 21, 40, 43, 46, 49, 52, 55, 58, 61])
+NORTH_M = np.where(np.arange(16) % 2, 800.0, 0.0)
+"""Two agents sail east, 800 m apart, and are seen in turns."""
+
+
+def detections(names: list[str | None] | None = None) -> pa.Table:
+    rows = [
+        {
+            "log_id": "walk", "time_ns": START_NS + int(time) * 10**9, "agent_id": name, "x_m": 5.0 * time, "y_m": north,
+            "cov_xx_m2": 1.0, "cov_xy_m2": 0.0, "cov_yy_m2": 1.0, "num_merged": 1, "topic": "/seen", "log_time_ns": 7,
+            "sequence": number,
+        }
+        for number, (time, north, name) in enumerate(zip(TIMES_S, NORTH_M, names or [None] * 16, strict=True))
+    ]  # fmt: skip
+    return pa.Table.from_pylist(rows, schema=DETECTIONS)
+
+
+TRUE = np.arange(16) % 2
+SWAPPED = np.where(np.arange(16) == 14, 1, TRUE)
+CLUTTERED = np.where(np.arange(16) == 15, -1, TRUE)
+WEIGHT = np.array([0.5, 0.375, 0.125])
+
+
+def three_ways(time_s, position_m, covariance_m2, origins_s, config, seed, habits=None) -> list[Associations]:
+    """The truth; one detection given to the other agent; one taken for clutter."""
+    label = np.stack([TRUE, SWAPPED, CLUTTERED])[:, : len(time_s)]
+    return [Associations(label[:, : int((time_s <= origin).sum())], WEIGHT, 2) for origin in origins_s]
+
+
+@pytest.fixture
+def stand_in(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(association, "associate", three_ways)
+    monkeypatch.setattr(association, "fit_habits", lambda *_: None)
+
+
+def mission(parent: Path, table: pa.Table) -> Path:
+    directory = parent / "walk"
+    directory.mkdir(parents=True)
+    write_table(table, directory / "detections.parquet", "detections", Frame("map"))
+    (directory / "obstacles.json").write_text(json.dumps({"version": 1, "obstacles": []}))
+    return directory
+
+
+def ways_of(table: pa.Table, num_hypotheses: int = 8) -> WayWindows:
+    sources = tell_sources(table, GRID, AssociationConfig(), 0)
+    return build_way_windows(table, sources, 0, num_hypotheses)
+
+
+def test_hypotheses_are_shared_out_by_weight() -> None:
+    for seed in range(20):
+        assert np.bincount(shared_out(WEIGHT, 8, seed), minlength=3).tolist() == [4, 3, 1]
+        odd = np.bincount(shared_out(np.array([0.7, 0.3]), 15, seed), minlength=2)
+        assert odd.sum() == 15 and abs(odd[0] - 10.5) < 1.0
+    assert set(shared_out(np.array([1.0, 0.0]), 5, 0).tolist()) == {0}
+    shares = np.mean([np.bincount(shared_out(np.array([0.9, 0.1]), 3, seed), minlength=2) for seed in range(2000)], axis=0)
+    assert shares == pytest.approx([2.7, 0.3], abs=0.05)
+
+
+@pytest.mark.usefixtures("stand_in")
+def test_tracks_that_ways_share_are_drawn_once() -> None:
+    ways = ways_of(detections())
+    assert ways.windows.agent_ids == ("a0", "a1") and ways.windows.batch.num_windows == 2
+    windows, column = ways.tracks(slice(0, 2))
+    # at the first origin all ways agree; at the second there are two readings of a0 (with and without detection 14) and
+    # three of a1 (with 14, without 15, and as it was)
+    assert windows.batch.is_active.sum(1).tolist() == [2, 5]
+    assert column.shape == (2, 8, 2) and bool((column >= 0).all())
+    assert len(column[0].unique(dim=0)) == 1 and column[1].unique(dim=0, return_counts=True)[1].sum() == 8
+    counts = sorted(column[1].unique(dim=0, return_counts=True)[1].tolist())
+    assert counts == [1, 3, 4]
+    assert sorted(windows.batch.detections.count[1].tolist()) == [3, 3, 4, 4, 5]
+
+
+@pytest.mark.usefixtures("stand_in")
+def test_every_way_is_a_window_for_estimators_of_several_agents() -> None:
+    ways = ways_of(detections())
+    windows, window, count = ways.ways(slice(0, 2))
+    assert window.tolist() == [0, 0, 0, 1, 1, 1] and count.tolist() == [4, 3, 1, 4, 3, 1]
+    assert windows.batch.detections.count[3:].tolist() == [[4, 4], [3, 5], [4, 3]]
+    assert len(set(windows.batch.seeds.tolist())) == 6
+
+    def sample(batch: WindowBatch, number: np.ndarray, size: int) -> HypothesisSet:
+        """Every agent stands at its number of detections; x is the window's number."""
+        position = torch.zeros(batch.num_windows, size, 2, batch.num_steps, 2)
+        position[..., 0] = torch.from_numpy(number)[:, None, None, None]
+        position[..., 1] = batch.detections.count[:, None, :, None]
+        weight = torch.full((batch.num_windows, size), 1.0 / size)
+        return HypothesisSet(position, weight, (("ok", "ok"),) * batch.num_windows)
+
+    ((part, position, weight, status),) = draw_ways(ways, 8, sample)
+    assert part.tolist() == [0, 1] and status == [["ok", "ok"], ["ok", "ok"]]
+    torch.testing.assert_close(weight, torch.full((2, 8), 0.125, dtype=torch.float64))
+    assert position[1, :, 0, 0, 0].tolist() == [1.0] * 8
+    assert position[1, :, 0, 0, 1].tolist() == [4] * 4 + [3] * 3 + [4]
+    assert position[1, :, 1, 0, 1].tolist() == [4] * 4 + [5] * 3 + [3]
+
+
+@pytest.mark.usefixtures("stand_in")
+def test_hypotheses_pass_through_the_detections_of_their_way(tmp_path: Path) -> None:
+    directory = mission(tmp_path, detections())
+    result = infer(directory, CONFIG, QUIET)
+    assert result.summary["association"] == {"num_detections": 16, "num_agents": 2, "mean_num_ways": 3.0}
+    last = read_hypothesis_tables(directory).windows[-1]
+    assert [agent.agent_id for agent in last.agents] == ["a0", "a1"] and last.weight.sum() == pytest.approx(1.0)
+    # detection 14 lies at 58 s, y = 0 m; the origin of the second window at 64 s, three steps later
+    step = last.origin_index - 3
+    south, north = (agent.position_m[:, step, 1] + agent.datum_m[1] for agent in last.agents)
+    assert np.abs(south).max() < 200.0  # a0 is there whether it was seen or not
+    assert sorted((north < 100.0).tolist()) == [False] * 5 + [True] * 3  # three of eight hypotheses took it for a1
+    assert [agent.probability for agent in last.agents] == [1.0, 1.0]
+    # detection 14: 0.375 bits of doubt between two; detection 15: 0.125 that it is clutter
+    doubt = [-(p * np.log2(p) + (1 - p) * np.log2(1 - p)) for p in (0.375, 0.125)]
+    expected = 0.625 * doubt[0] / 3.625, (0.375 * doubt[0] + 0.875 * doubt[1]) / (3 + 0.375 + 0.875)
+    assert [agent.association_entropy_bits for agent in last.agents] == pytest.approx(expected)
+
+
+@pytest.mark.usefixtures("stand_in")
+def test_table_of_associations(tmp_path: Path) -> None:
+    directory = mission(tmp_path, detections())
+    infer(directory, CONFIG, QUIET)
+    table, frame = read_table(directory / "associations.parquet", "associations")
+    assert table.schema.equals(ASSOCIATIONS) and frame == Frame("map")
+    found = {(row["sequence"], row["agent_id"]): row for row in table.to_pylist()}
+    assert len(found) == 16 + 2 and found[0, "a0"]["probability"] == 1.0
+    assert found[14, "a0"]["probability"] == 0.625 and found[14, "a1"]["probability"] == 0.375
+    assert found[15, None]["first_probability"] == 0.125 and found[15, "a1"]["first_probability"] == 0.875
+    assert [found[number, "a0"]["first_window"] for number in (0, 6, 8, 14)] == [0, 0, 1, 1]
+    infer(directory, dataclasses.replace(CONFIG, is_associated=False), QUIET)
+    assert not (directory / "associations.parquet").exists()
+    assert read_hypothesis_tables(directory).agent_ids == (UNKNOWN_AGENT,)
+
+
+def test_an_agent_may_be_missing_from_a_hypothesis(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def associate(time_s, position_m, covariance_m2, origins_s, config, seed, habits=None) -> list[Associations]:
+        label = np.stack([TRUE, np.where(TRUE == 1, -1, 0)])
+        return [Associations(label[:, : int((time_s <= o).sum())], np.array([0.75, 0.25]), 3) for o in origins_s]
+
+    monkeypatch.setattr(association, "associate", associate)
+    monkeypatch.setattr(association, "fit_habits", lambda *_: None)
+    directory = mission(tmp_path, detections())
+    infer(directory, CONFIG, QUIET)
+    for window in read_hypothesis_tables(directory).windows:
+        first, second, third = window.agents
+        assert (first.probability, second.probability, third.probability) == (1.0, 0.75, 0.0)
+        assert np.isfinite(first.position_m).all() and not third.is_live and third.status == "no_detections"
+        is_there = np.isfinite(second.position_m).all(axis=(1, 2))
+        assert is_there.sum() == 6 and np.isnan(second.position_m[~is_there]).all()
+        assert second.spread_m is not None and np.isfinite(second.spread_m) and second.num_detections == 4
+
+
+@pytest.mark.usefixtures("stand_in")
+def test_named_agents_stay_what_they_are(tmp_path: Path) -> None:
+    """The first eight detections are of unknown origin, the others have names, one of them a name that would be ours."""
+    names: list[str | None] = [None] * 8 + ["a0" if number % 2 else "wolf" for number in range(8)]
+    directory = mission(tmp_path, detections(names))
+    infer(directory, CONFIG, QUIET)
+    found = read_hypothesis_tables(directory)
+    assert found.agent_ids == ("a0", "a1", "a2", "wolf")
+    by_name = {agent.agent_id: agent for agent in found.windows[-1].agents}
+    assert by_name["wolf"].probability is None and by_name["wolf"].num_detections == 4
+    assert by_name["a1"].probability == 0.0 or by_name["a1"].num_detections < 4
+    table, _ = read_table(directory / "associations.parquet", "associations")
+    assert set(table["sequence"].to_pylist()) == set(range(8)) and set(table["agent_id"].to_pylist()) == {"a1", "a2"}
+
+
+def test_all_of_it_clutter_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def associate(time_s, position_m, covariance_m2, origins_s, config, seed, habits=None) -> list[Associations]:
+        return [Associations(np.full((1, int((time_s <= o).sum())), -1), np.ones(1), 0) for o in origins_s]
+
+    monkeypatch.setattr(association, "associate", associate)
+    monkeypatch.setattr(association, "fit_habits", lambda *_: None)
+    with pytest.raises(InputError, match="clutter_share"):
+        infer(mission(tmp_path, detections()), CONFIG, QUIET)
+
+
+def test_the_real_filter_finds_both_agents_and_repeats_itself(tmp_path: Path) -> None:
+    config = dataclasses.replace(CONFIG, association=AssociationConfig(num_particles=20))
+    tables = []
+    for name in ("one", "two"):
+        directory = mission(tmp_path / name, detections())
+        infer(directory, config, QUIET)
+        tables.append([read_table(directory / f"{t}.parquet", t)[0] for t in ("hypotheses", "windows", "associations")])
+    assert all(one.equals(two) for one, two in zip(*tables, strict=True))
+    rows = [row for row in tables[0][2].to_pylist() if row["probability"] > 0.5]
+    south = {row["agent_id"] for row in rows if row["sequence"] % 2 == 0}
+    north = {row["agent_id"] for row in rows if row["sequence"] % 2 == 1}
+    assert len(south) == len(north) == 1 and south != north
