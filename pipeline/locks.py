@@ -2,7 +2,9 @@
 
 import contextlib
 import fcntl
+import glob
 import os
+import shutil
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -13,7 +15,7 @@ _POLL_S = 0.1
 
 
 @contextlib.contextmanager
-def locked(folder: Path, on_wait: Callable[[str], None]) -> Iterator[None]:
+def locked(folder: Path, on_wait: Callable[[str], object] = len) -> Iterator[None]:
     """Hold `folder`, made where it is absent, alone among all processes; where it stays empty, it is removed again.
 
     Waits while another process holds it, and says so once through `on_wait`. A file system that knows no locks is said
@@ -28,7 +30,14 @@ def locked(folder: Path, on_wait: Callable[[str], None]) -> Iterator[None]:
         os.close(handle)
 
 
-def is_held(folder: Path) -> bool:
+def clear_abandoned(folder: Path, prefix: str) -> None:
+    """Remove what in `folder` begins with `prefix` and is held by no process: a killed one left it."""
+    for path in folder.glob(f"{glob.escape(prefix)}*"):
+        if not _is_held(path):
+            shutil.rmtree(path, ignore_errors=True)
+
+
+def _is_held(folder: Path) -> bool:
     """Whether a process holds `folder`, or may hold it where the file system knows no locks."""
     try:
         handle = os.open(folder, os.O_RDONLY)
@@ -43,7 +52,7 @@ def is_held(folder: Path) -> bool:
     return False
 
 
-def _hold(folder: Path, on_wait: Callable[[str], None]) -> int:
+def _hold(folder: Path, on_wait: Callable[[str], object]) -> int:
     has_told = False
     while True:
         try:

@@ -17,6 +17,7 @@ from typing import Any, Literal
 
 from cadence.errors import DeviceError, InputError
 from pipeline.config import config_as_dict
+from pipeline.locks import clear_abandoned, locked
 from pipeline.provenance import versions
 
 JsonObject = Mapping[str, Any]
@@ -24,11 +25,11 @@ JsonObject = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class StageResult:
-    """What one stage did for one log; `summary` is JSON-able and printed by `--json`."""
+    """What one stage did for one log; `summary` is JSON-able and printed by `--json`. Published outputs are URLs."""
 
     stage: str
     status: Literal["done", "skipped"]
-    outputs: tuple[Path, ...]
+    outputs: tuple[Path | str, ...]
     summary: JsonObject
 
 
@@ -78,6 +79,7 @@ def run_stage(
         "inputs": {path.name: hash_file(path) for path in inputs},
         "versions": versions(),
     }
+    clear_abandoned(directory, f".{stage}.")
     earlier = read_manifest(stage, directory)
     if not force and earlier is not None:
         skipped = _still_valid(stage, directory, earlier, key)
@@ -87,28 +89,25 @@ def run_stage(
         summary = body(work)
         names = sorted(path.name for path in work.iterdir())
         manifest = {**key, "outputs": {name: hash_file(work / name) for name in names}, "summary": dict(summary)}
-        # A manifest of an earlier run must not vouch for a mixture of old and new files.
+        # While the earlier manifest is there, it knows which files to remove; it must not vouch for a mixture of old and new.
+        for name in set((earlier or {}).get("outputs", ())) - set(names):
+            (directory / Path(name).name).unlink(missing_ok=True)
         manifest_path(stage, directory).unlink(missing_ok=True)
         for name in names:
             os.replace(work / name, directory / name)
-        for name in set((earlier or {}).get("outputs", ())) - set(names):
-            (directory / Path(name).name).unlink(missing_ok=True)
         write_atomic(manifest_path(stage, directory), json.dumps(manifest, indent=1, sort_keys=True) + "\n")
     return StageResult(stage, "done", tuple(directory / name for name in names), summary)
 
 
 def write_atomic(path: Path, text: str) -> None:
     """Write a small text file so that readers see the old or the new content, never a part."""
-    # Not tempfile: its files are private to the user, and results are to be shared like any other file.
-    draft = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        draft.write_text(text, encoding="utf-8")
-        os.replace(draft, path)
-    except OSError as error:
-        with contextlib.suppress(OSError):
-            draft.unlink()
-        raise DeviceError(f"{path}: cannot write ({error.strerror}); check the folder and the free space") from error
+    clear_abandoned(path.parent, f".{path.name}.")
+    with _working_folder(path.name, path.parent) as work:
+        try:
+            (work / path.name).write_text(text, encoding="utf-8")
+            os.replace(work / path.name, path)
+        except OSError as error:
+            raise DeviceError(f"{path}: cannot write ({error.strerror}); check the folder and the free space") from error
 
 
 def _still_valid(stage: str, directory: Path, earlier: JsonObject, key: JsonObject) -> StageResult | None:
@@ -132,7 +131,8 @@ def _working_folder(stage: str, directory: Path) -> Iterator[Path]:
     except OSError as error:
         raise DeviceError(f"{directory}: cannot write there ({error.strerror}); choose another folder with --out") from error
     try:
-        yield work
+        with locked(work):  # so that others know it from what a killed process left
+            yield work
     except OSError as error:
         raise DeviceError(f"{directory}: {stage} could not write its output ({error}); check the free space") from error
     finally:

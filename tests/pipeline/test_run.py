@@ -1,16 +1,19 @@
 """Many logs through all stages: failures stay with their log, and directories never collide."""
 
+import json
 from pathlib import Path
 
 import pytest
 
-import pipeline.run as module
-from cadence.errors import CadenceError, DeviceError, InputError, UsageError
+import pipeline.batch as module
+from cadence.errors import DeviceError, InputError, UsageError
+from pipeline.batch import RunConfig, exit_code
 from pipeline.manifest import StageResult
 from pipeline.missions import mission_directories
 from pipeline.progress import Progress
-from pipeline.run import RunConfig, exit_code, run
+from pipeline.run import run, selection_settings
 
+QUIET = Progress(quiet=True)
 STAGES = ("ingest", "extract", "infer", "export", "report")
 
 
@@ -40,49 +43,82 @@ def calls(monkeypatch):
     return record
 
 
+def run_here(stems, out, progress=QUIET, force=False):
+    """`run` in this process, where stages can be replaced."""
+    return run([f"{stem}.mcap" for stem in stems], str(out), RunConfig(), progress, force, num_workers=0)
+
+
 def test_every_log_goes_through_every_stage_in_order(calls, tmp_path):
     config = RunConfig()
-    results = run([Path("a.mcap"), Path("b.mcap")], tmp_path, config, Progress(quiet=True), force=True)
+    outcomes = run_here("ab", tmp_path, force=True)
     expected = [(stage, stem, getattr(config, stage), True) for stem in "ab" for stage in STAGES]
     assert calls == expected
-    assert [result.directory for result in results] == [tmp_path / "a", tmp_path / "b"]
-    assert all(tuple(stage.stage for stage in result.stages) == STAGES for result in results)
-    assert exit_code(results) == 0
+    assert [outcome.task.directory for outcome in outcomes] == [f"{tmp_path}/a", f"{tmp_path}/b"]
+    assert all(tuple(stage.stage for stage in outcome.stages) == STAGES for outcome in outcomes)
+    assert exit_code(outcomes) == 0 and {outcome.status for outcome in outcomes} == {"done"}
 
 
 def test_a_bad_log_does_not_stop_the_others(calls, tmp_path, capsys):
     calls.failing = {("extract", "b"): InputError("b.mcap: no detections"), ("export", "c"): DeviceError("disk full")}
-    results = run([Path(f"{stem}.mcap") for stem in "abcd"], tmp_path, RunConfig(), Progress(quiet=True))
-    assert [len(result.stages) for result in results] == [5, 1, 3, 5]
-    assert [None if r.error is None else str(r.error) for r in results] == [None, "b.mcap: no detections", "disk full", None]
-    assert exit_code(results) == 5
+    outcomes = run_here("abcd", tmp_path)
+    assert [len(outcome.stages) for outcome in outcomes] == [5, 1, 3, 5]
+    assert [outcome.message for outcome in outcomes] == ["", "b.mcap: no detections", "disk full", ""]
+    assert exit_code(outcomes) == 5
     assert capsys.readouterr() == ("", "")
 
 
 def test_a_defect_shows_its_traceback_and_does_not_stop_the_others(calls, tmp_path, capsys):
     calls.failing = {("infer", "a"): ZeroDivisionError("division by zero")}
-    results = run([Path("a.mcap"), Path("b.mcap")], tmp_path, RunConfig(), Progress(quiet=True))
-    assert type(results[0].error) is CadenceError and "defect in infer (ZeroDivisionError" in str(results[0].error)
-    assert results[1].error is None and exit_code(results) == 1
+    outcomes = run_here("ab", tmp_path)
+    assert outcomes[0].exit_code == 1 and "defect in infer (ZeroDivisionError" in outcomes[0].message
+    assert outcomes[1].exit_code == 0 and exit_code(outcomes) == 1
     captured = capsys.readouterr()
     assert "Traceback" in captured.err and captured.out == ""
+
+
+def test_memory_that_ran_out_is_no_defect(calls, tmp_path):
+    calls.failing = {("infer", "a"): MemoryError()}
+    assert [(outcome.exit_code, "fewer --workers" in outcome.message) for outcome in run_here("a", tmp_path)] == [(5, True)]
 
 
 def test_interruption_is_not_a_failure_of_a_log(calls, tmp_path):
     calls.failing = {("infer", "a"): KeyboardInterrupt()}
     with pytest.raises(KeyboardInterrupt):
-        run([Path("a.mcap"), Path("b.mcap")], tmp_path, RunConfig(), Progress(quiet=True))
+        run_here("ab", tmp_path)
 
 
-def test_progress_tells_which_log(calls, tmp_path, capsys):
-    run([Path("a.mcap"), Path("b.mcap")], tmp_path, RunConfig(), Progress())
+def test_progress_tells_which_log_is_finished(calls, tmp_path, capsys):
+    run_here("ab", tmp_path, Progress())
     captured = capsys.readouterr()
-    assert "[2/2] b.mcap" in captured.err and "infer: done" in captured.err and captured.out == ""
+    assert "[2/2] b: done" in captured.err and captured.out == ""
 
 
 def test_no_log_is_a_wrong_call(tmp_path):
     with pytest.raises(UsageError, match="no log given"):
-        run([], tmp_path, RunConfig(), Progress(quiet=True))
+        run_here("", tmp_path)
+
+
+def test_report_tells_of_every_log(calls, tmp_path):
+    calls.failing = {("extract", "b"): InputError("b.mcap: no detections")}
+    report = tmp_path / "more" / "night.json"
+    run(["a.mcap", "b.mcap"], str(tmp_path), RunConfig(), QUIET, num_workers=0, report=report)
+    record = json.loads(report.read_text())
+    assert report.read_text() == (tmp_path / "batch.json").read_text()
+    assert (record["num_logs"], record["num_done"], record["num_failed"], record["exit_code"]) == (2, 1, 1, 3)
+    assert [log["status"] for log in record["logs"]] == ["done", "failed"]
+    assert record["logs"][1]["error"] == {"message": "b.mcap: no detections", "exit_code": 3}
+
+
+def test_a_number_of_workers_that_cannot_be(tmp_path):
+    with pytest.raises(UsageError, match="--workers -1"):
+        run(["a.mcap"], str(tmp_path), RunConfig(), QUIET, num_workers=-1)
+
+
+def test_flags_that_select_are_settings_of_extract():
+    assert selection_settings(None, None, ()) == []
+    assert selection_settings("10:00", "1 h", ["/a", "/b*"]) == [
+        'extract.start="10:00"', 'extract.end="1 h"', 'extract.topics=["/a", "/b*"]',
+    ]  # fmt: skip
 
 
 def test_directories_of_logs_that_share_a_stem_differ_and_do_not_depend_on_the_order():
