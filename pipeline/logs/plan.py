@@ -17,6 +17,7 @@ class Block:
     offset, length  bytes in the file; for loose records they begin with a record head, for chunks with the chunk's fields
     kind            a "cut" chunk is the last thing in a file that ends inside it
     num_messages    by channel id
+    index_length    bytes of the message indexes behind a chunk, where they are known to agree with it; else 0
     """
 
     offset: int
@@ -24,8 +25,8 @@ class Block:
     kind: Literal["chunk", "cut", "loose"]
     start_ns: int
     end_ns: int
-    is_sorted: bool
     num_messages: Mapping[int, int]
+    index_length: int = 0
 
 
 @dataclass(frozen=True)
@@ -72,8 +73,6 @@ class LooseRun:
     end: int = -1
     first: int = 2**64
     last: int = -1
-    previous: int = -1
-    is_sorted: bool = True
     counts: Counter[int] = field(default_factory=Counter)
 
     def add(self, begin: int, end: int, channel_id: int, log_time: int) -> None:
@@ -82,10 +81,8 @@ class LooseRun:
             self.begin = begin
         self.end = end
         self.counts[channel_id] += 1
-        self.is_sorted = self.is_sorted and log_time >= self.previous
-        self.previous = log_time
         self.first, self.last = min(self.first, log_time), max(self.last, log_time)
 
     def block(self) -> Block:
         """The block of the records so far."""
-        return Block(self.begin, self.end - self.begin, "loose", self.first, self.last, self.is_sorted, dict(self.counts))
+        return Block(self.begin, self.end - self.begin, "loose", self.first, self.last, dict(self.counts))

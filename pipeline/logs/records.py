@@ -9,10 +9,13 @@ import contextlib
 import struct
 import zlib
 from collections.abc import Iterator
+from dataclasses import dataclass, field
 from io import BytesIO
 from typing import Final
 
 import lz4.frame
+import numpy as np
+import numpy.typing as npt
 import zstandard
 from mcap import records
 from mcap.data_stream import ReadDataStream
@@ -24,6 +27,8 @@ HEAD: Final = struct.Struct("<BQ")
 """Opcode and length in front of every record."""
 MESSAGE_HEAD: Final = struct.Struct("<HIQQ")
 """Channel id, sequence, log time and publish time in front of the data of a message."""
+INDEX_ENTRY: Final = np.dtype([("log_time", "<u8"), ("offset", "<u8")])
+"""One message in a MessageIndex record; the offset is that of the message record inside the unpacked chunk."""
 CHUNK_HEAD: Final = struct.Struct("<QQQII")
 """Start time, end time, uncompressed size, CRC and length of the name of the compression."""
 CHUNK_HEAD_BYTES: Final = 64
@@ -66,6 +71,15 @@ class StrictStream(ReadDataStream):
         return data
 
 
+def library_of(body: bytes) -> str:
+    """Who wrote the file, from the body of its Header record; empty where that cannot be read."""
+    try:
+        with damage():
+            return str(records.Header.read(StrictStream(body)).library)
+    except DamagedRecord:
+        return ""
+
+
 def parse_channel(body: bytes) -> records.Channel:
     """The Channel record with this body; `DamagedRecord` where it is none."""
     with damage():
@@ -87,39 +101,51 @@ def parse_metadata(body: bytes) -> records.Metadata:
     return record
 
 
-def parse_chunk(body: bytes) -> records.Chunk:
-    """The Chunk record with this body, still compressed; `DamagedRecord` where its lengths contradict each other."""
+@dataclass(frozen=True)
+class PackedChunk:
+    """A Chunk record, still compressed; `data` is a view of its body."""
+
+    start_ns: int
+    end_ns: int
+    uncompressed_size: int
+    crc: int
+    compression: str
+    data: memoryview = field(repr=False)
+
+
+def parse_chunk(body: bytes) -> PackedChunk:
+    """The Chunk record with this body; `DamagedRecord` where its lengths contradict each other."""
     with damage():
-        stream = StrictStream(body)
-        chunk: records.Chunk = records.Chunk.read(stream)
-    if stream.count != len(body):
-        raise DamagedRecord(f"{len(body) - stream.count} bytes too many in the chunk")
-    return chunk
+        start, end, size, crc, name_length = CHUNK_HEAD.unpack_from(body)
+        name = body[CHUNK_HEAD.size : CHUNK_HEAD.size + name_length].decode()
+    if not is_chunk_head(body[: CHUNK_HEAD.size + name_length + 8], len(body)):
+        raise DamagedRecord("the lengths in the chunk contradict each other")
+    return PackedChunk(start, end, size, crc, name, memoryview(body)[CHUNK_HEAD.size + name_length + 8 :])
 
 
-def parse_message_index(body: bytes) -> tuple[int, list[tuple[int, int]]]:
-    """Channel id, and (log time, offset inside the chunk) of its messages, from the MessageIndex record with this body."""
+def parse_message_index(body: bytes) -> tuple[int, npt.NDArray[np.void]]:
+    """Channel id and entries (`INDEX_ENTRY`) of the MessageIndex record with this body."""
     with damage():
         channel_id, length = struct.unpack_from("<HI", body)
-    if length != len(body) - 6 or length % 16:
+    if length != len(body) - 6 or length % INDEX_ENTRY.itemsize:
         raise DamagedRecord("the lengths in a message index contradict each other")
-    return channel_id, list(struct.iter_unpack("<QQ", body[6:]))
+    return channel_id, np.frombuffer(body, INDEX_ENTRY, offset=6)
 
 
-def unpack_chunk(chunk: records.Chunk) -> bytes:
+def unpack_chunk(chunk: PackedChunk) -> bytes:
     """The records inside `chunk`, CRC checked; `DamagedRecord` where anything is wrong with it."""
     if chunk.uncompressed_size > MAX_CHUNK_BYTES:
         raise DamagedRecord(f"it declares {chunk.uncompressed_size} bytes, more than the limit of {MAX_CHUNK_BYTES}")
     with damage():
         data = _decompress(chunk)
-    if chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc:
+    if chunk.crc and zlib.crc32(data) != chunk.crc:
         raise DamagedRecord("its checksum does not match")
-    if not chunk.uncompressed_crc and len(data) != chunk.uncompressed_size:
+    if not chunk.crc and len(data) != chunk.uncompressed_size:
         raise DamagedRecord(f"it holds {len(data)} bytes instead of {chunk.uncompressed_size}")
     return data
 
 
-def unpack_cut_chunk(body: bytes) -> tuple[records.Chunk, bytes]:
+def unpack_cut_chunk(body: bytes) -> tuple[PackedChunk, bytes]:
     """The chunk whose body is cut off by the end of the file, and what can be unpacked of it; no checksum covers that."""
     with damage():
         start, end, size, crc, name_length = CHUNK_HEAD.unpack_from(body)
@@ -131,7 +157,7 @@ def unpack_cut_chunk(body: bytes) -> tuple[records.Chunk, bytes]:
             data = lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=min(size, MAX_CHUNK_BYTES))
         elif compression:
             raise DamagedRecord(f"it uses the compression {compression!r}, which is not known")
-    return records.Chunk(compression, b"", end, start, crc, size), data
+    return PackedChunk(start, end, size, crc, compression, memoryview(b"")), data
 
 
 def is_chunk_head(head: bytes, length: int) -> bool:
@@ -142,9 +168,9 @@ def is_chunk_head(head: bytes, length: int) -> bool:
     return len(head) >= inner + 8 and int.from_bytes(head[inner : inner + 8], "little") == length - inner - 8
 
 
-def _decompress(chunk: records.Chunk) -> bytes:
+def _decompress(chunk: PackedChunk) -> bytes:
     if chunk.compression == "":
-        return chunk.data
+        return bytes(chunk.data)
     if chunk.uncompressed_size == 0 and not chunk.data:
         return b""
     if chunk.compression == "zstd":

@@ -7,11 +7,12 @@ plan of what is left. Chunks are decompressed one at a time and their CRCs check
 import bisect
 import struct
 import zlib
-from collections import Counter
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import BinaryIO, Final, TypeVar
 
+import numpy as np
+import numpy.typing as npt
 from mcap import records
 from mcap.opcode import Opcode
 
@@ -20,14 +21,14 @@ from pipeline.logs.records import (
     CHUNK_HEAD,
     CHUNK_HEAD_BYTES,
     HEAD,
+    INDEX_ENTRY,
     MAGIC,
     MAX_CHUNK_BYTES,
     MAX_TIME_NS,
     MESSAGE_HEAD,
     DamagedRecord,
-    StrictStream,
-    damage,
     is_chunk_head,
+    library_of,
     parse_channel,
     parse_chunk,
     parse_message_index,
@@ -35,14 +36,15 @@ from pipeline.logs.records import (
     parse_schema,
     unpack_chunk,
     unpack_cut_chunk,
-    walk,
 )
 from pipeline.logs.resync import find_records
+from pipeline.logs.rows import Index, Rows, rows_by_index, rows_by_walk
 from pipeline.logs.summary import parse_summary_record, read_summary
 
 LOOSE_BLOCK_BYTES: Final = 2**20
 """Messages outside chunks are planned in stretches of about this size."""
 _READ_BYTES: Final = 2**20
+_DATA_END: Final = struct.Struct("<BQI")
 _Definition = TypeVar("_Definition", records.Channel, records.Schema)
 _MAX_BODY_BYTES: Final = MAX_CHUNK_BYTES + CHUNK_HEAD_BYTES
 _MAX_SMALL_BYTES: Final = 2**26  # channels, schemas, metadata, message indexes; larger ones are not believed
@@ -65,19 +67,20 @@ class _Scanner:
             self.plan.remarks.append(fault)
         self.places = self.plan.summary.places if self.plan.summary else []
         self.limit = self.plan.summary.data_end if self.plan.summary else size
-        self.crc = 0
+        self.crc: int | None = None  # over all data so far; None where the file states none
         self.position = self.reported = 0
         self.loose = LooseRun()
         self.previous = 0  # opcode of the record before: a message index follows a chunk or another one
         self.broken_chunk: int | None = None  # index of the loss of the chunk just before, to be counted by its indexes
-        self.unchecked: dict[int, list[tuple[int, int]]] | None = None  # messages of the chunk just before, without a CRC
-        self.num_unknown = self.num_timeless = 0
+        self.unchecked: Rows | None = None  # messages of the chunk just before, which has no CRC and differs from its index
+        self.num_unknown = self.num_timeless = self.num_bad_indexes = 0
         self.definitions: set[bytes] = set()
         self.chunks: set[int] = set()
 
     def run(self) -> None:
         """Fill the plan."""
-        self.crc = zlib.crc32(self._read(0, len(MAGIC)))
+        if self._states_checksum():
+            self.crc = zlib.crc32(self._read(0, len(MAGIC)))
         self.position = len(MAGIC)
         while self.position < self.limit and not self.plan.reached_end:
             try:
@@ -113,17 +116,25 @@ class _Scanner:
         if opcode != Opcode.MESSAGE_INDEX:
             self.broken_chunk = self.unchecked = None
         body = self._take(opcode, offset + HEAD.size, length)
-        if not self.plan.reached_end:
+        if not self.plan.reached_end and self.crc is not None:
             self.crc = zlib.crc32(head, self.crc)
             if body is None:
-                self._crc_of_rest(offset + HEAD.size, length)
+                self.crc = self._crc_of_rest(self.crc, offset + HEAD.size, length)
             else:
                 self.crc = zlib.crc32(body, self.crc)
         self.previous, self.position = opcode, end
 
-    def _crc_of_rest(self, offset: int, length: int) -> None:
+    def _states_checksum(self) -> bool:
+        """Whether the end mark of the data may have a checksum over all of them: seldom, and it costs time."""
+        if self.plan.summary is None:
+            return True
+        opcode, length, crc = _DATA_END.unpack(self._read(self.limit - _DATA_END.size, _DATA_END.size))
+        return (opcode, length, crc) != (Opcode.DATA_END, 4, 0)
+
+    def _crc_of_rest(self, crc: int, offset: int, length: int) -> int:
         for begin in range(offset, offset + length, _READ_BYTES):
-            self.crc = zlib.crc32(self._read(begin, min(_READ_BYTES, offset + length - begin)), self.crc)
+            crc = zlib.crc32(self._read(begin, min(_READ_BYTES, offset + length - begin)), crc)
+        return crc
 
     def _take(self, opcode: int, offset: int, length: int) -> bytes | None:
         """Plan the record; its body where it was read."""
@@ -175,30 +186,27 @@ class _Scanner:
             parse_metadata(body)
             self.plan.metadata_spans.append((offset, len(body)))
         elif self.previous == 0:
-            self.plan.library = _library(body)
+            self.plan.library = library_of(body)
         return body
 
-    def _compare_index(self, offset: int, channel_id: int, entries: list[tuple[int, int]]) -> None:
-        """Count what a broken chunk held, or check the times in a chunk that has no checksum."""
+    def _compare_index(self, offset: int, channel_id: int, entries: npt.NDArray[np.void]) -> None:
+        """Count what a broken chunk held, or say which index a chunk without checksum differs from."""
         if self.broken_chunk is not None:
             loss = self.plan.losses[self.broken_chunk]
             known = (loss.num_messages or 0) + len(entries)
             self.plan.losses[self.broken_chunk] = Loss(loss.offset, loss.reason, loss.span_ns, known)
-        elif self.unchecked is not None and sorted(self.unchecked.get(channel_id, ())) != sorted(entries):
+        elif self.unchecked is not None and not _agrees(self.unchecked, channel_id, entries):
             where = f"At byte {offset}: the messages of a chunk without checksum differ from their index"
             self.plan.doubts.append(f"{where}; times of channel {channel_id} may be wrong.")
 
     def _take_chunk(self, offset: int, body: bytes) -> None:
         chunk = parse_chunk(body)
         self.chunks.add(offset - HEAD.size)
-        self.unchecked = None
-        if not chunk.uncompressed_crc:
-            self.plan.has_checksums = False
-            self.unchecked = {}
+        self.plan.has_checksums = self.plan.has_checksums and chunk.crc != 0
         try:
-            block = self._block_of_chunk(offset, len(body), unpack_chunk(chunk))
+            block = self._block_of_chunk(offset, len(body), unpack_chunk(chunk), has_checksum=chunk.crc != 0)
         except DamagedRecord as error:
-            span = self._span(offset - HEAD.size, chunk.message_start_time, chunk.message_end_time)
+            span = self._span(offset - HEAD.size, chunk.start_ns, chunk.end_ns)
             self.plan.losses.append(Loss(offset - HEAD.size, str(error), span))
             self.broken_chunk = len(self.plan.losses) - 1
         else:
@@ -222,7 +230,7 @@ class _Scanner:
             raise DamagedRecord("a chunk is longer than the file")
         chunk, data = unpack_cut_chunk(body)
         block = self._block_of_chunk(offset, len(body), data, is_cut=True)
-        start, end = max(block.end_ns, chunk.message_start_time), chunk.message_end_time
+        start, end = max(block.end_ns, chunk.start_ns), chunk.end_ns
         saved = sum(block.num_messages.values())
         if saved:
             self._flush_loose()
@@ -231,28 +239,38 @@ class _Scanner:
         self.plan.losses.append(Loss(offset - HEAD.size, reason, (start, end) if _is_span(start, end) else None))
         self.position = self.size
 
-    def _block_of_chunk(self, offset: int, length: int, data: bytes, is_cut: bool = False) -> Block:
-        counts: Counter[int] = Counter()
-        first, last, previous, is_sorted = 2**64, -1, -1, True
-        definitions = []
-        unpack = MESSAGE_HEAD.unpack_from
-        for opcode, begin, end in walk(data, is_cut):
-            if opcode == Opcode.MESSAGE:
-                channel_id, _, log_time, _ = unpack(data, begin)
-                if log_time > MAX_TIME_NS:
-                    self.num_timeless += 1
-                    continue
-                counts[channel_id] += 1
-                is_sorted = is_sorted and log_time >= previous
-                previous = log_time
-                first, last = min(first, log_time), max(last, log_time)
-                if self.unchecked is not None:
-                    self.unchecked.setdefault(channel_id, []).append((log_time, begin - HEAD.size))
-            elif opcode in (Opcode.CHANNEL, Opcode.SCHEMA):
-                definitions.append((opcode, data[begin:end]))
+    def _block_of_chunk(self, offset: int, length: int, data: bytes, has_checksum: bool = True, is_cut: bool = False) -> Block:
+        """The block of a chunk: planned by the indexes behind it where they agree with it, else by a walk through it."""
+        index, index_length = ([], 0) if is_cut else self._index_behind(offset + length)
+        found = rows_by_index(data, index) if index_length else None
+        if found is None:
+            found = rows_by_walk(data, is_cut)
+            self.unchecked = None if has_checksum else found[0]
+            self.num_bad_indexes += has_checksum and index_length > 0
+            index_length = 0
+        rows, definitions = found[0].usable(), found[1]
+        self.num_timeless += len(found[0]) - len(rows)
         for opcode, body in definitions:  # only now: a chunk whose end is broken must not leave half of itself behind
             self._define(opcode, body)
-        return Block(offset, length, "cut" if is_cut else "chunk", first, last, is_sorted, dict(counts))
+        first, last = (int(rows.log_time_ns.min()), int(rows.log_time_ns.max())) if len(rows) else (2**64, -1)
+        ids, counts = np.unique(rows.channel_id, return_counts=True)
+        num_messages = dict(zip(ids.tolist(), counts.tolist(), strict=True))
+        return Block(offset, length, "cut" if is_cut else "chunk", first, last, num_messages, index_length)
+
+    def _index_behind(self, offset: int) -> tuple[Index, int]:
+        """The message indexes that follow a chunk, up to the first that is damaged, and how many bytes they take."""
+        begin, found = offset, []
+        while offset + HEAD.size <= self.limit:
+            opcode, length = HEAD.unpack(self._read(offset, HEAD.size))
+            is_whole = length <= _MAX_SMALL_BYTES and offset + HEAD.size + length <= self.limit
+            if opcode != Opcode.MESSAGE_INDEX or not is_whole:
+                break
+            try:
+                found.append(parse_message_index(self._read(offset + HEAD.size, length)))
+            except DamagedRecord:
+                break
+            offset += HEAD.size + length
+        return (found, offset - begin) if any(len(entries) for _, entries in found) else ([], 0)
 
     def _define(self, opcode: int, body: bytes) -> None:
         """Take a channel or schema; a second definition that differs is reported, the first stays."""
@@ -331,6 +349,8 @@ class _Scanner:
             plan.doubts.append("The file ends without its end mark: the recording was cut off.")
         if self.num_timeless:
             plan.doubts.append(f"{self.num_timeless} messages have log times after the year 2262 and cannot be used.")
+        if self.num_bad_indexes:
+            plan.remarks.append(f"{self.num_bad_indexes} chunks differ from their message indexes, which were not used.")
         if summary is None or summary.statistics is None:
             if self.num_unknown:
                 plan.doubts.append(f"{self.num_unknown} unknown records were skipped; no statistics tell whether any mattered.")
@@ -347,6 +367,14 @@ class _Scanner:
                 plan.losses.append(Loss(offset, "the chunk that the index names is not there", span))
 
 
+def _agrees(rows: Rows, channel_id: int, entries: npt.NDArray[np.void]) -> bool:
+    """Whether a message index names the messages of its channel, in any order."""
+    own = rows[rows.channel_id == channel_id]
+    found = np.empty(len(own), INDEX_ENTRY)
+    found["log_time"], found["offset"] = own.log_time_ns, own.begin - HEAD.size - MESSAGE_HEAD.size
+    return np.array_equal(np.sort(found), np.sort(entries))
+
+
 def _prefer_index(kind: str, known: dict[int, _Definition], indexed: Mapping[int, _Definition]) -> list[str]:
     """Put the definitions of the index into `known`: it has a checksum, records outside chunks have none."""
     doubts = []
@@ -360,12 +388,3 @@ def _prefer_index(kind: str, known: dict[int, _Definition], indexed: Mapping[int
 def _is_span(start: int, end: int) -> bool:
     """Whether times from the header of a chunk, which no checksum covers, can be a span."""
     return 0 < start <= end < 2**63
-
-
-def _library(body: bytes) -> str:
-    """Who wrote the file, from its header; empty where that cannot be read."""
-    try:
-        with damage():
-            return str(records.Header.read(StrictStream(body)).library)
-    except DamagedRecord:
-        return ""

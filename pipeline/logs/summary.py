@@ -31,6 +31,7 @@ class Summary:
 
     data_end  the byte after the DataEnd record
     chunks    index by the offset of the chunk record
+    metadata_spans  offset and length of the bodies of the Metadata records that are indexed
     places    sorted offsets where records are known to begin; empty where no chunk is indexed
     """
 
@@ -39,6 +40,7 @@ class Summary:
     schemas: dict[int, records.Schema] = field(default_factory=dict)
     statistics: records.Statistics | None = None
     chunks: dict[int, records.ChunkIndex] = field(default_factory=dict)
+    metadata_spans: list[tuple[int, int]] = field(default_factory=list)
     places: list[int] = field(default_factory=list)
 
 
@@ -111,3 +113,5 @@ def _add(summary: Summary, opcode: int, body: bytes) -> None:
             summary.chunks[record.chunk_start_offset] = record
         elif isinstance(record, records.MetadataIndex | records.AttachmentIndex):
             summary.places.append(record.offset)
+            if isinstance(record, records.MetadataIndex):
+                summary.metadata_spans.append((record.offset + HEAD.size, record.length - HEAD.size))

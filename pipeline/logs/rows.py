@@ -1,0 +1,152 @@
+"""Where the messages of a block lie, as arrays: found by the message indexes of a chunk, or by a walk over its records.
+
+An index is believed only where it accounts for every byte: its messages must be where it says, with its channels and
+times, and between them there may be no other message. Then no record has to be walked one by one.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import Any, Final, Self
+
+import numpy as np
+import numpy.typing as npt
+from mcap.opcode import Opcode
+
+from pipeline.logs.records import HEAD, MAX_TIME_NS, MESSAGE_HEAD, DamagedRecord, walk
+
+Index = Sequence[tuple[int, npt.NDArray[np.void]]]
+"""Channel ids and entries, as `parse_message_index` gives them."""
+Definitions = list[tuple[int, bytes]]
+"""Opcode and body of the channels and schemas in a chunk, in its order."""
+_MESSAGE: Final = np.dtype(
+    [
+        ("opcode", "u1"),
+        ("length", "<u8"),
+        ("channel_id", "<u2"),
+        ("sequence", "<u4"),
+        ("log_time", "<u8"),
+        ("publish_time", "<u8"),
+    ]
+)
+assert _MESSAGE.itemsize == HEAD.size + MESSAGE_HEAD.size
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """N messages of one block; begin and end are those of their data in the block's unpacked bytes.
+
+    Times are uint64 nanoseconds, as the file has them; those after `MAX_TIME_NS` are for `usable` to leave out.
+    """
+
+    channel_id: npt.NDArray[np.uint16]
+    sequence: npt.NDArray[np.uint32]
+    log_time_ns: npt.NDArray[np.uint64]
+    publish_time_ns: npt.NDArray[np.uint64]
+    begin: npt.NDArray[np.int64]
+    end: npt.NDArray[np.int64]
+
+    def __post_init__(self) -> None:
+        if len({getattr(self, item.name).shape for item in fields(self)}) != 1 or self.begin.ndim != 1:
+            raise ValueError("the columns of rows must have one length")
+
+    def __len__(self) -> int:
+        return len(self.begin)
+
+    def __getitem__(self, rows: Any) -> Self:
+        """The rows of a mask, of indices or of a slice."""
+        return type(self)(*(getattr(self, item.name)[rows] for item in fields(self)))
+
+    @classmethod
+    def concatenate(cls, parts: Sequence["Rows"]) -> "Rows":
+        """All rows of `parts`, in order."""
+        return cls(*(np.concatenate([getattr(part, item.name) for part in parts]) for item in fields(cls)))
+
+    def usable(self) -> "Rows":
+        """The rows whose log times fit into int64."""
+        mask = self.log_time_ns <= MAX_TIME_NS
+        return self if mask.all() else self[mask]
+
+    def by_time(self) -> "Rows":
+        """The rows by log time, then by place in the block."""
+        if (self.log_time_ns[1:] >= self.log_time_ns[:-1]).all() and (self.begin[1:] > self.begin[:-1]).all():
+            return self
+        return self[np.lexsort((self.begin, self.log_time_ns))]
+
+
+def rows_by_walk(data: bytes, is_cut: bool = False) -> tuple[Rows, Definitions]:
+    """Messages and definitions in the unpacked bytes of a block; raises `DamagedRecord` as `walk` does."""
+    offsets, definitions = _walked(data, is_cut)
+    return _rows(data, np.array(offsets, dtype=np.int64)), definitions
+
+
+def rows_by_index(data: bytes, index: Index) -> tuple[Rows, Definitions] | None:
+    """The same as `rows_by_walk`, by the message indexes of the chunk; None where they do not agree with its content."""
+    offsets = np.concatenate([entries["offset"] for _, entries in index])
+    if (offsets > np.uint64(max(0, len(data) - _MESSAGE.itemsize))).any() or len(data) < _MESSAGE.itemsize:
+        return None
+    order = np.argsort(offsets, kind="stable")
+    begin = offsets[order].astype(np.int64)
+    heads = _heads(data)[begin]
+    times = np.concatenate([entries["log_time"] for _, entries in index])[order]
+    ids = np.repeat([number for number, _ in index], [len(entries) for _, entries in index])[order]
+    length = heads["length"]
+    is_message = (heads["opcode"] == Opcode.MESSAGE) & (length >= MESSAGE_HEAD.size) & (length <= len(data))
+    if not (is_message & (heads["log_time"] == times) & (heads["channel_id"] == ids)).all():
+        return None
+    end = begin + HEAD.size + length.astype(np.int64)
+    definitions = _between(data, np.append(0, end), np.append(begin, len(data)))
+    return None if definitions is None else (_rows_of(heads, begin, end), definitions)
+
+
+def indexed_rows(data: bytes, index: Index) -> Rows:
+    """The messages of those indexes that are given, of a chunk whose indexes have been found to agree with it."""
+    offsets = np.sort(np.concatenate([entries["offset"] for _, entries in index]).astype(np.int64))
+    if len(offsets) and not 0 <= offsets[0] <= offsets[-1] <= len(data) - _MESSAGE.itemsize:
+        raise DamagedRecord("a message index points outside its chunk")
+    rows = _rows(data, offsets)
+    if (rows.end > len(data)).any() or not np.isin(rows.channel_id, [number for number, _ in index]).all():
+        raise DamagedRecord("a message index differs from its chunk")
+    return rows
+
+
+def _walked(data: bytes, is_cut: bool) -> tuple[list[int], Definitions]:
+    offsets, definitions = [], []
+    for opcode, begin, end in walk(data, is_cut):
+        if opcode == Opcode.MESSAGE:
+            offsets.append(begin - HEAD.size)
+        elif opcode in (Opcode.CHANNEL, Opcode.SCHEMA):
+            definitions.append((opcode, data[begin:end]))
+    return offsets, definitions
+
+
+def _between(data: bytes, begin: npt.NDArray[np.int64], end: npt.NDArray[np.int64]) -> Definitions | None:
+    """Definitions in the stretches between messages; None where messages overlap or one is not in the index."""
+    if (begin > end).any():
+        return None
+    definitions = []
+    for place in np.flatnonzero(begin < end).tolist():
+        try:
+            offsets, found = _walked(data[begin[place] : end[place]], is_cut=False)
+        except DamagedRecord:
+            return None
+        if offsets:
+            return None
+        definitions += found
+    return definitions
+
+
+def _rows(data: bytes, offsets: npt.NDArray[np.int64]) -> Rows:
+    heads = _heads(data)[offsets]
+    return _rows_of(heads, offsets, offsets + HEAD.size + heads["length"].astype(np.int64))
+
+
+def _rows_of(heads: npt.NDArray[np.void], begin: npt.NDArray[np.int64], end: npt.NDArray[np.int64]) -> Rows:
+    ids, sequence, log_time, publish_time = (
+        np.ascontiguousarray(heads[name]) for name in ("channel_id", "sequence", "log_time", "publish_time")
+    )
+    return Rows(ids, sequence, log_time, publish_time, begin + _MESSAGE.itemsize, end)
+
+
+def _heads(data: bytes) -> npt.NDArray[np.void]:
+    """The head of a message at every byte: a view with a stride of one."""
+    return np.ndarray((max(0, len(data) - _MESSAGE.itemsize + 1),), _MESSAGE, data, strides=(1,))

@@ -1,0 +1,218 @@
+"""Messages of one or several files in log-time order, from planned blocks, in bounded memory.
+
+Blocks are taken by their first time. What lies before the first time of the next block is given out; the rest waits as
+arrays of places. Where many blocks overlap, their bytes are not all held but read again, a stretch of time after another.
+"""
+
+import contextlib
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO, Final, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from cadence.errors import InputError
+from pipeline.logs.channels import Batch, Channel, RawMessage, batches_of, raw_messages
+from pipeline.logs.plan import Block
+from pipeline.logs.records import (
+    MAX_TIME_NS,
+    DamagedRecord,
+    parse_chunk,
+    parse_message_index,
+    unpack_chunk,
+    unpack_cut_chunk,
+    walk,
+)
+from pipeline.logs.rows import Rows, indexed_rows, rows_by_walk
+
+MAX_HELD_BYTES: Final = 2**27
+"""So many bytes of unpacked blocks, and of messages that wait for each other, are held where blocks overlap."""
+
+
+@dataclass(frozen=True)
+class Selection:
+    """What is wanted: channels, by the ids that each file uses, and log times from start_ns up to, not including, end_ns."""
+
+    channels: Sequence[Mapping[int, Channel]]
+    start_ns: int = 0
+    end_ns: int = MAX_TIME_NS + 1
+
+
+@dataclass(frozen=True)
+class Source:
+    """One file of a mission, as it was planned. `channels` are those of the mission by the ids that the file uses."""
+
+    path: Path
+    size_bytes: int
+    blocks: tuple[Block, ...]
+    channels: Mapping[int, Channel]
+    metadata_spans: tuple[tuple[int, int], ...]
+
+
+@dataclass(frozen=True, eq=False)
+class _Piece:
+    """Messages of one block, by time. `key` is the place of the block: number of the source, offset in its file."""
+
+    key: tuple[int, int]
+    block: Block
+    rows: Rows
+
+    def split(self, bound: tuple[float, int, int]) -> tuple["_Piece", "_Piece"]:
+        """The rows before and after the beginning of another block (time, source, offset)."""
+        if bound[0] == math.inf:
+            place = len(self.rows)
+        else:
+            side: Literal["left", "right"] = "right" if self.key < bound[1:] else "left"
+            place = int(np.searchsorted(self.rows.log_time_ns, np.uint64(bound[0]), side))
+        return _Piece(self.key, self.block, self.rows[:place]), _Piece(self.key, self.block, self.rows[place:])
+
+
+class Timeline:
+    """One pass over the selected messages of `sources`."""
+
+    def __init__(self, sources: Sequence[Source], selection: Selection, on_bytes: Callable[[int], object] | None) -> None:
+        self.sources, self.selection, self.on_bytes = sources, selection, on_bytes
+        self.held: dict[tuple[int, int], bytes] = {}  # unpacked blocks, the one used last at the end
+        places = [(block.start_ns, number, block.offset, block) for number, part in enumerate(sources) for block in part.blocks]
+        self.places = sorted(places, key=lambda place: place[:3])
+
+    def messages(self) -> Iterator[RawMessage]:
+        """All messages by log time; those of one time in the order of the sources and of the file."""
+        waiting: list[_Piece] = []
+        bounds = [*(place[:3] for place in self.places[1:]), (math.inf, 0, 0)]
+        for (_, number, offset, block), bound in zip(self.places, bounds, strict=False):
+            if self._is_wanted(number, block):
+                data, rows = self._load(number, block)
+                self._hold((number, offset), data)
+                waiting.append(_Piece((number, offset), block, rows))
+            if waiting:
+                pairs = [piece.split(bound) for piece in waiting]
+                yield from self._in_order([ready for ready, _ in pairs if len(ready.rows)])
+                waiting = [rest for _, rest in pairs if len(rest.rows)]
+                self.held = {piece.key: self.held[piece.key] for piece in waiting if piece.key in self.held}
+            self._advance(block)
+        self._finish()
+
+    def batches(self) -> Iterator[Batch]:
+        """The messages of each block and channel at a time, the blocks by their first log time."""
+        for _, number, _, block in self.places:
+            if self._is_wanted(number, block):
+                data, rows = self._load(number, block)
+                yield from batches_of(self.sources[number].channels, data, rows)
+            self._advance(block)
+        self._finish()
+
+    def _is_wanted(self, number: int, block: Block) -> bool:
+        is_in_time = block.start_ns < self.selection.end_ns and block.end_ns >= self.selection.start_ns
+        return is_in_time and not block.num_messages.keys().isdisjoint(self.selection.channels[number])
+
+    def _advance(self, block: Block) -> None:
+        if self.on_bytes is not None:
+            self.on_bytes(block.length)
+
+    def _finish(self) -> None:
+        if self.on_bytes is not None:
+            total = sum(part.size_bytes - sum(block.length for block in part.blocks) for part in self.sources)
+            self.on_bytes(total)
+
+    def _load(self, number: int, block: Block) -> tuple[bytes, Rows]:
+        """The bytes of a block, and its selected messages by time."""
+        part, wanted = self.sources[number], self.selection.channels[number]
+        with reading(part.path) as file:
+            data = _unpacked(file, block)
+            index = b"" if block.index_length == 0 else read_span(file, block.offset + block.length, block.index_length)
+            rows = _indexed(data, index, wanted) if index else rows_by_walk(data, block.kind == "cut")[0].usable()
+        mask = np.isin(rows.channel_id, list(wanted))
+        mask &= (rows.log_time_ns >= self.selection.start_ns) & (rows.log_time_ns < np.uint64(self.selection.end_ns))
+        return data, (rows if mask.all() else rows[mask]).by_time()
+
+    def _hold(self, key: tuple[int, int], data: bytes) -> None:
+        """Keep the bytes of a block for a while, and forget those that have not been used for the longest time."""
+        self.held.pop(key, None)
+        self.held[key] = data
+        total = sum(map(len, self.held.values()))
+        for old in list(self.held)[:-1]:
+            if total <= MAX_HELD_BYTES:
+                break
+            total -= len(self.held.pop(old))
+
+    def _bytes(self, piece: _Piece) -> bytes:
+        data = self.held.get(piece.key)
+        if data is None:
+            with reading(self.sources[piece.key[0]].path) as file:
+                data = _unpacked(file, piece.block)
+        self._hold(piece.key, data)
+        return data
+
+    def _in_order(self, pieces: list[_Piece]) -> Iterator[RawMessage]:
+        """The messages of all `pieces` by time, then by place."""
+        if len(pieces) == 1:
+            yield from raw_messages(self.sources[pieces[0].key[0]].channels, self._bytes(pieces[0]), pieces[0].rows)
+            return
+        if not pieces:
+            return
+        pieces = sorted(pieces, key=lambda piece: piece.key)
+        rows = Rows.concatenate([piece.rows for piece in pieces])
+        owner = np.repeat(np.arange(len(pieces)), [len(piece.rows) for piece in pieces])
+        order = np.argsort(rows.log_time_ns, kind="stable")
+        filled = np.cumsum((rows.end - rows.begin)[order])
+        cuts = np.flatnonzero(np.diff(filled // MAX_HELD_BYTES)) + 1
+        for stretch in np.split(order, cuts):
+            yield from self._stretch(pieces, rows, owner, stretch)
+
+    def _stretch(
+        self, pieces: list[_Piece], rows: Rows, owner: npt.NDArray[np.int64], stretch: npt.NDArray[np.int64]
+    ) -> list[RawMessage]:
+        """The messages rows[stretch], of which `owner` says from which piece they are: every piece is read once."""
+        found: list[tuple[int, RawMessage]] = []
+        owners = owner[stretch]
+        for number in np.unique(owners).tolist():
+            places = np.flatnonzero(owners == number)
+            channels = self.sources[pieces[number].key[0]].channels
+            messages = raw_messages(channels, self._bytes(pieces[number]), rows[stretch[places]])
+            found += zip(places.tolist(), messages, strict=True)
+        return [message for _, message in sorted(found, key=lambda item: item[0])]
+
+
+def read_span(file: BinaryIO, offset: int, length: int) -> bytes:
+    """So many bytes of the file; `DamagedRecord` where it has become shorter."""
+    file.seek(offset)
+    data = file.read(length)
+    if len(data) != length:
+        raise DamagedRecord("the file has become shorter")
+    return data
+
+
+@contextlib.contextmanager
+def reading(path: Path) -> Iterator[BinaryIO]:
+    """The file at `path`, which was there before; whatever goes wrong becomes an `InputError`."""
+    try:
+        file = path.open("rb")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read any more ({error.strerror}); was it moved?") from error
+    try:
+        with file:
+            yield file
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); check the disk") from error
+    except DamagedRecord as error:
+        raise InputError(f"{path}: was changed while it was being read ({error}); run again") from error
+
+
+def _unpacked(file: BinaryIO, block: Block) -> bytes:
+    data = read_span(file, block.offset, block.length)
+    if block.kind == "chunk":
+        return unpack_chunk(parse_chunk(data))
+    return unpack_cut_chunk(data)[1] if block.kind == "cut" else data
+
+
+def _indexed(data: bytes, index: bytes, wanted: Mapping[int, Channel]) -> Rows:
+    """The messages of the wanted channels by the message indexes behind the chunk."""
+    found = []
+    for _, begin, end in walk(index):
+        if int.from_bytes(index[begin : begin + 2], "little") in wanted:
+            found.append(parse_message_index(index[begin:end]))
+    return indexed_rows(data, found).usable() if found else rows_by_walk(b"")[0]
