@@ -19,7 +19,7 @@ from pipeline.export.playback import Scene, Tick, build_scenes, plan_ticks
 from pipeline.ingest import CATALOGUE_NAME, Catalogue, read_catalogue
 from pipeline.layouts import build_layout, build_legacy_layout
 from pipeline.logs.append import write_combined
-from pipeline.logs.recorder import Compression
+from pipeline.logs.recorder import Compression, Packing
 from pipeline.logs.scene import encode_scene
 from pipeline.logs.writer import LogWriter
 from pipeline.manifest import StageResult, hash_file, manifest_path, read_manifest, run_stage
@@ -120,7 +120,7 @@ def _export(directory: Path, work: Path, catalogue: Catalogue, config: ExportCon
     side = work / f"{stem}.cadence.mcap"
     counts = _write_side_file(side, directory, mission, config, progress)
     if config.combined:
-        write_combined(catalogue.path, side, work / f"{stem}.combined.mcap", config.compression, progress)
+        write_combined(catalogue.path, side, work / f"{stem}.combined.mcap", Packing(config.compression), progress)
     topics = sorted(counts)
     for name, layout in (("layout", build_layout), ("layout.legacy", build_legacy_layout)):
         content = layout(mission.hypotheses.frame, mission.style, catalogue.channels, topics)
@@ -233,7 +233,7 @@ def _positions(detections: pa.Table) -> npt.NDArray[np.float64]:
 def _write_side_file(path: Path, directory: Path, mission: _Mission, config: ExportConfig, progress: Progress) -> Counter[str]:
     """Write every message in the order of time; the number of messages by topic."""
     counts: Counter[str] = Counter()
-    with LogWriter(path, config.compression) as writer, progress.bar(len(mission.ticks), "export", "tick") as bar:
+    with LogWriter(path, Packing(config.compression)) as writer, progress.bar(len(mission.ticks), "export", "tick") as bar:
         for time_ns, channel, data in _in_order(mission, config):
             writer.write(channel, time_ns, data)
             counts[channel.topic] += 1

@@ -12,7 +12,7 @@ from typing import BinaryIO, Final
 from cadence.errors import InputError
 from pipeline.logs.index import MAX_ID
 from pipeline.logs.reader import Channel, MissionLog, open_log
-from pipeline.logs.recorder import Compression, Recorder
+from pipeline.logs.recorder import Packing, Recorder
 from pipeline.logs.records import DamagedRecord
 from pipeline.logs.source_index import SourceIndex, read_index
 from pipeline.progress import Progress
@@ -20,7 +20,7 @@ from pipeline.progress import Progress
 _BLOCK_BYTES: Final = 2**20
 
 
-def write_combined(source: Path, side: Path, target: Path, compression: Compression, progress: Progress) -> None:
+def write_combined(source: Path, side: Path, target: Path, packing: Packing, progress: Progress) -> None:
     """Write `target`: all bytes of `source` before the end of its data, then messages and metadata of `side`, one index.
 
     Schemas and channels of `side` get ids above those of `source`. Memory is bounded by a chunk of either; `target` appears
@@ -35,7 +35,7 @@ def write_combined(source: Path, side: Path, target: Path, compression: Compress
         with source.open("rb") as source_file, draft.open("wb") as target_file:
             found = _read_index(source, source_file, added)
             checksum = _copy(source, source_file, target_file, found, progress)
-            recorder = Recorder(target_file, compression, found.index, found.data_end, checksum)
+            recorder = Recorder(target_file, packing, found.index, found.data_end, checksum)
             _add(added, recorder, progress)
             recorder.finish()
         os.replace(draft, target)

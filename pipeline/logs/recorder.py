@@ -3,6 +3,7 @@
 import struct
 import zlib
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import BinaryIO, Final, Literal
 
 import lz4.frame
@@ -16,13 +17,28 @@ from pipeline.logs.records import MAGIC, MESSAGE_HEAD
 
 Compression = Literal["zstd", "lz4", "none"]
 
-CHUNK_BYTES: Final = 4 * 1024 * 1024
-"""Scene messages are some 100 kB and resemble their neighbours: a chunk must hold many for the compressor to see it."""
-
-ZSTD_LEVEL: Final = 3
-
 _MESSAGE: Final = struct.Struct("<BQHIQQ")
 """Opcode, length, and the fields in front of the data of a message."""
+
+
+@dataclass(frozen=True)
+class Packing:
+    """How messages are put into chunks; the defaults are chosen by measurement (docs/benchmarks/log_writing.md).
+
+    compression  zstd, lz4 or none
+    chunk_bytes  a chunk ends with the message that fills it; before compression
+    level        how hard zstd tries
+    """
+
+    compression: Compression = "zstd"
+    chunk_bytes: int = 4 * 2**20
+    level: int = 3
+
+    def compressor(self) -> Callable[[bytes], bytes]:
+        """What packs the content of a chunk; the same bytes for the same content."""
+        if self.compression == "zstd":
+            return zstandard.ZstdCompressor(level=self.level).compress
+        return lz4.frame.compress if self.compression == "lz4" else bytes
 
 
 class Recorder:
@@ -32,12 +48,9 @@ class Recorder:
     says nothing, as the format allows).
     """
 
-    def __init__(
-        self, file: BinaryIO, compression: Compression, index: Index, position: int = 0, checksum: int | None = 0
-    ) -> None:
+    def __init__(self, file: BinaryIO, packing: Packing, index: Index, position: int = 0, checksum: int | None = 0) -> None:
         self._file, self._index, self._position, self._checksum = file, index, position, checksum
-        self._compression = compression
-        self._compress = _compressor(compression)
+        self._packing, self._compress = packing, packing.compressor()
         self._chunk = bytearray()
         self._entries: dict[int, list[tuple[int, int]]] = {}
 
@@ -70,7 +83,7 @@ class Recorder:
         length = MESSAGE_HEAD.size + len(data)
         self._chunk += _MESSAGE.pack(Opcode.MESSAGE, length, channel_id, sequence, log_time_ns, publish_time_ns)
         self._chunk += data
-        if len(self._chunk) >= CHUNK_BYTES:
+        if len(self._chunk) >= self._packing.chunk_bytes:
             self._end_chunk()
 
     def add_metadata(self, name: str, content: Mapping[str, str]) -> None:
@@ -100,7 +113,8 @@ class Recorder:
         entries = {number: np.array(rows, dtype="<u8") for number, rows in self._entries.items()}
         first_ns = min(int(rows[:, 0].min()) for rows in entries.values())
         last_ns = max(int(rows[:, 0].max()) for rows in entries.values())
-        packed, name = self._compress(bytes(self._chunk)), "" if self._compression == "none" else self._compression
+        packed = self._compress(bytes(self._chunk))
+        name = "" if self._packing.compression == "none" else self._packing.compression
         chunk = records.Chunk(
             compression=name, data=packed, message_start_time=first_ns, message_end_time=last_ns,
             uncompressed_crc=zlib.crc32(self._chunk), uncompressed_size=len(self._chunk),
@@ -124,9 +138,3 @@ def _encode_entries(channel_id: int, rows: np.ndarray[tuple[int, ...], np.dtype[
     """A MessageIndex record from rows of log time and offset."""
     data = rows.tobytes()
     return struct.pack("<BQHI", Opcode.MESSAGE_INDEX, len(data) + 6, channel_id, len(data)) + data
-
-
-def _compressor(compression: Compression) -> Callable[[bytes], bytes]:
-    if compression == "zstd":
-        return zstandard.ZstdCompressor(level=ZSTD_LEVEL).compress
-    return lz4.frame.compress if compression == "lz4" else bytes

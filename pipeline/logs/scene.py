@@ -96,7 +96,7 @@ def round_positions(position_m: Floats, extent_m: float) -> npt.NDArray[np.float
 
     The eye cannot tell, and the zero bits at the end of every number compress well.
     """
-    quantum = 2.0 ** np.floor(np.log2(max(extent_m, 1e-6) / 16384.0))
+    quantum = 2.0 ** np.round(np.log2(max(extent_m, 1e-6) / 16384.0))
     # Adding zero turns -0.0 into 0.0.
     rounded: npt.NDArray[np.float64] = np.round(np.asarray(position_m, np.float64) / quantum) * quantum + 0.0
     return rounded

@@ -13,7 +13,7 @@ import foxglove_schemas_protobuf.SceneUpdate_pb2 as scene_update
 from google.protobuf import descriptor_pb2
 
 from pipeline.logs.index import Index
-from pipeline.logs.recorder import Compression, Recorder
+from pipeline.logs.recorder import Packing, Recorder
 from schemas.channels import DESCRIPTOR_PATH, Channel
 
 LIBRARY = "cadence"
@@ -37,9 +37,9 @@ class LogWriter:
     Channels are added when first written to. Messages should come in the order of their times: chunks then do not overlap.
     """
 
-    def __init__(self, path: Path, compression: Compression = "zstd", profile: str = "", library: str = LIBRARY) -> None:
+    def __init__(self, path: Path, packing: Packing | None = None, profile: str = "", library: str = LIBRARY) -> None:
         self._path = path
-        self._compression: Compression = compression
+        self._packing = packing or Packing()
         self._header = (profile, library)
         self._channel_ids: dict[Channel, int] = {}
         self._schema_ids: dict[str, int] = {}
@@ -50,7 +50,7 @@ class LogWriter:
     def __enter__(self) -> Self:
         """Create the file."""
         self._file = self._path.open("wb")
-        self._recorder = Recorder(self._file, self._compression, Index())
+        self._recorder = Recorder(self._file, self._packing, Index())
         self._recorder.start(*self._header)
         return self
 

@@ -5,6 +5,7 @@ from mcap.writer import Writer
 
 from cadence.errors import InputError
 from pipeline.logs.append import write_combined
+from pipeline.logs.recorder import Packing
 from pipeline.logs.writer import LogWriter, foxglove_class, schema_bytes
 from pipeline.progress import Progress
 from schemas.channels import AGENTS, SCENE, TRANSFORM, message_class
@@ -13,7 +14,7 @@ QUIET = Progress(quiet=True)
 
 
 def write(path, compression="zstd", num_messages=100):
-    with LogWriter(path, compression) as writer:
+    with LogWriter(path, Packing(compression)) as writer:
         for index in range(num_messages):
             writer.write((SCENE, AGENTS)[index % 2], 10 + index, bytes([index]) * 50)
         writer.metadata("cadence", {"a": "b"})
@@ -47,7 +48,7 @@ def test_error_inside_is_not_hidden_and_the_file_is_closed(tmp_path):
         writer.write(AGENTS, 1, b"")
         1 / 0  # noqa: B018
     with pytest.raises(InputError), (tmp_path / "a.mcap").open("rb"):
-        write_combined(tmp_path / "a.mcap", tmp_path / "a.mcap", tmp_path / "b.mcap", "zstd", QUIET)
+        write_combined(tmp_path / "a.mcap", tmp_path / "a.mcap", tmp_path / "b.mcap", Packing(), QUIET)
 
 
 @pytest.mark.parametrize(
@@ -93,7 +94,7 @@ def test_combined_keeps_every_record_of_the_source(tmp_path, chunking):
     source, side, target = (tmp_path / f"{name}.mcap" for name in ("source", "side", "target"))
     source_log(source, chunking=chunking)
     write(side)
-    write_combined(source, side, target, "zstd", QUIET)
+    write_combined(source, side, target, Packing(), QUIET)
     profile, rows, attachments = content(target)
     assert profile == "ros2"
     assert attachments == content(source)[2]
@@ -104,7 +105,7 @@ def test_combined_keeps_every_record_of_the_source(tmp_path, chunking):
 def test_source_of_the_same_topic_stays_apart(tmp_path):
     side, target = tmp_path / "side.mcap", tmp_path / "target.mcap"
     write(side, num_messages=6)
-    write_combined(side, side, target, "zstd", QUIET)
+    write_combined(side, side, target, Packing(), QUIET)
     assert len(content(target)[1]) == 12
 
 
@@ -115,7 +116,7 @@ def test_damaged_source_is_refused(tmp_path, keep):
     write(side)
     source.write_bytes(source.read_bytes()[:keep])
     with pytest.raises(InputError, match=r"source\.mcap: is damaged"):
-        write_combined(source, side, tmp_path / "target.mcap", "zstd", QUIET)
+        write_combined(source, side, tmp_path / "target.mcap", Packing(), QUIET)
 
 
 def test_flipped_byte_in_a_chunk_is_refused(tmp_path):
@@ -126,7 +127,7 @@ def test_flipped_byte_in_a_chunk_is_refused(tmp_path):
     data[data.index(bytes([7]) * 50) + 3] ^= 1
     source.write_bytes(data)
     with pytest.raises(InputError, match="damaged"):
-        write_combined(source, side, tmp_path / "target.mcap", "zstd", QUIET)
+        write_combined(source, side, tmp_path / "target.mcap", Packing(), QUIET)
 
 
 def test_message_without_its_channel_is_refused(tmp_path):
@@ -138,7 +139,7 @@ def test_message_without_its_channel_is_refused(tmp_path):
     data[at] = 0x7F  # an opcode that readers skip
     source.write_bytes(data)
     with pytest.raises(InputError, match="damaged"):
-        write_combined(source, side, tmp_path / "target.mcap", "zstd", QUIET)
+        write_combined(source, side, tmp_path / "target.mcap", Packing(), QUIET)
 
 
 def test_transform_is_written_with_a_published_schema():
