@@ -23,6 +23,7 @@ from pipeline.manifest import StageResult
 from pipeline.missions import find_missions
 from pipeline.progress import Progress, Told
 from pipeline.report import ReportConfig, report
+from pipeline.storage import shown
 
 Status = Literal["done", "skipped", "partial", "failed"]
 
@@ -54,6 +55,11 @@ class LogTask:
     size_bytes: int
     config: RunConfig
     force: bool = False
+
+    @property
+    def log(self) -> str:
+        """Its log, or the first part of it, as it may be shown."""
+        return shown(self.parts[0])
 
     @property
     def name(self) -> str:
@@ -120,11 +126,11 @@ def run_task(task: LogTask, progress: Progress) -> LogOutcome:
     except CadenceError as error:
         message, code = str(error), error.exit_code
     except MemoryError:
-        message, code = f"{task.parts[0]}: out of memory; use fewer --workers", DeviceError.exit_code
+        message, code = f"{task.log}: out of memory; use fewer --workers", DeviceError.exit_code
     except Exception as error:  # a defect met by one log of a long batch must not cost the results of the others
         trace = traceback.format_exc()
         stage_name = _STAGES[len(finished)][0] if len(finished) < len(_STAGES) else "run"
-        message = f"{task.parts[0]}: defect in {stage_name} ({type(error).__name__}: {error}); please report its traceback"
+        message = f"{task.log}: defect in {stage_name} ({type(error).__name__}: {error}); please report its traceback"
         code = CadenceError.exit_code
     return LogOutcome(task, tuple(finished), " ".join(message.split()), code, time.monotonic() - started_s, trace)
 

@@ -2,6 +2,7 @@
 
 import glob
 import hashlib
+import itertools
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -10,6 +11,7 @@ from typing import Final
 
 from cadence.errors import InputError, UsageError
 from pipeline.logs.parts import group_parts, mission_name
+from pipeline.storage import StoredObject, find_objects, is_url, shown, url_name
 
 _OWN_ENDINGS: Final = (".cadence.mcap", ".combined.mcap")
 
@@ -27,15 +29,19 @@ class Mission:
 
 
 def find_missions(logs: Sequence[str], out: str) -> tuple[Mission, ...]:
-    """The missions among files, folders (searched through), patterns and URLs, each once, in the order given.
+    """The missions among files, folders (searched through), patterns and URLs, each once, in the order given, URLs last.
 
     `UsageError` where nothing is given, `InputError` where a folder or a pattern holds no log.
     """
     if not logs:
         raise UsageError("no log given; name at least one MCAP file")
-    groups = [tuple(map(str, group)) for group in group_parts([path for text in logs for path in _paths(text)])]
+    texts = [text.removeprefix("file://") for text in logs]
+    paths = [path for text in texts if not is_url(text) for path in _paths(text)]
+    sizes = {found.url: found.size_bytes for text in texts if is_url(text) for found in _objects(text)}
+    groups = [*(tuple(map(str, group)) for group in group_parts(paths)), *((url,) for url in sizes)]
+    sizes |= {str(path): path.stat().st_size for path in map(Path, itertools.chain(*groups)) if path.is_file()}
     return tuple(
-        Mission(group, directory, sum(Path(part).stat().st_size for part in group if Path(part).is_file()))
+        Mission(group, directory, sum(sizes.get(part, 0) for part in group))
         for group, directory in zip(groups, _directories(groups, out), strict=True)
     )
 
@@ -71,6 +77,14 @@ def _paths(text: str) -> Iterator[Path]:
         yield from _some(logs, f"{text}: no MCAP log fits this pattern; correct it")
 
 
+def _objects(url: str) -> tuple[StoredObject, ...]:
+    """The logs that a URL means: an object, all below a prefix, or what fits a pattern."""
+    found = find_objects(url, _is_log_name)
+    if not found:
+        raise InputError(f"{shown(url)}: holds no MCAP log; check the URL")
+    return found
+
+
 def _some(logs: list[Path], otherwise: str) -> list[Path]:
     if not logs:
         raise InputError(otherwise)
@@ -83,16 +97,27 @@ def _logs_below(folder: Path) -> list[Path]:
 
 
 def _is_log(path: Path, folder: Path | None = None) -> bool:
-    inner = path.relative_to(folder).parts if folder is not None else (path.name,)
-    return path.is_file() and not path.name.endswith(_OWN_ENDINGS) and not any(part.startswith(".") for part in inner)
+    inner = path.relative_to(folder) if folder is not None else Path(path.name)
+    return path.is_file() and not path.name.endswith(_OWN_ENDINGS) and not any(part.startswith(".") for part in inner.parts)
+
+
+def _is_log_name(name: str) -> bool:
+    """The same of a name in a store."""
+    is_own = name.endswith(_OWN_ENDINGS)
+    return name.endswith(".mcap") and not is_own and not any(part.startswith(".") for part in name.split("/"))
+
+
+def _place(part: str) -> Path:
+    """Where a part lies, as a path that also URLs have: only its names matter."""
+    return Path(shown(part)).parent / url_name(part) if is_url(part) else Path(part).resolve()
 
 
 def _directories(groups: Sequence[tuple[str, ...]], out: str) -> list[str]:
     """`out`/<name of the mission>; where several share the name, with a hash of where the first part lies."""
-    names = [mission_name([Path(part) for part in group]) for group in groups]
+    names = [mission_name([_place(part) for part in group]) for group in groups]
     counts = Counter(names)
     found = []
     for name, group in zip(names, groups, strict=True):
-        suffix = "-" + hashlib.sha256(str(Path(group[0]).resolve()).encode()).hexdigest()[:8] if counts[name] > 1 else ""
+        suffix = "-" + hashlib.sha256(str(_place(group[0])).encode()).hexdigest()[:8] if counts[name] > 1 else ""
         found.append(f"{out.rstrip('/') or '/'}/{name}{suffix}")
     return found

@@ -15,8 +15,8 @@ from typing import Literal
 from cadence.errors import UsageError
 from pipeline.batch import Engine, LogOutcome, LogTask, RunConfig, exit_code, plan_tasks, run_tasks
 from pipeline.engines.local import run_in_processes, run_in_sequence
-from pipeline.manifest import write_atomic
 from pipeline.progress import Progress, Told
+from pipeline.remote import run_anywhere, write_text
 from pipeline.summaries import batch_record, to_json
 
 REPORT_NAME = "batch.json"
@@ -36,13 +36,14 @@ def run(
     Raises `UsageError` or `InputError` where there is no log at all.
     """
     started_s = time.monotonic()
+    out = out.removeprefix("file://").rstrip("/") or "/"
     tasks = plan_tasks(logs, out, config, force)
     chosen = choose_engine(engine, len(tasks), num_workers)
     with _interruptible(), contextlib.closing(_Shown(tasks, progress)) as shown:
-        outcomes = run_tasks(tasks, chosen, shown.finished, shown.watch)
+        outcomes = run_tasks(tasks, chosen, shown.finished, shown.watch, run_anywhere)
     text = to_json(batch_record(outcomes, exit_code(outcomes), time.monotonic() - started_s)) + "\n"
-    for path in [Path(out) / REPORT_NAME, *([report] if report is not None else [])]:
-        write_atomic(path, text)
+    for place in [f"{out}/{REPORT_NAME}", *([str(report)] if report is not None else [])]:
+        write_text(place, text)
     return outcomes
 
 

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from pipeline.manifest import StageResult
+from pipeline.storage import shown
 
 if TYPE_CHECKING:
     from pipeline.batch import LogOutcome
@@ -51,8 +52,9 @@ def log_record(outcome: "LogOutcome") -> dict[str, Any]:
     error = {"message": outcome.message, "exit_code": outcome.exit_code} if outcome.exit_code else None
     task = outcome.task
     return {
-        "log": task.parts[0], "parts": task.parts, "directory": task.directory, "status": outcome.status, "error": error,
-        "size_bytes": task.size_bytes, "elapsed_s": round(outcome.elapsed_s, 3), "stages": outcome.stages,
+        "log": task.log, "parts": tuple(map(shown, task.parts)), "directory": shown(task.directory),
+        "status": outcome.status, "error": error, "size_bytes": task.size_bytes,
+        "elapsed_s": round(outcome.elapsed_s, 3), "stages": outcome.stages,
     }  # fmt: skip
 
 

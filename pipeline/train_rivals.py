@@ -288,7 +288,7 @@ class _Best:
 
     def ship(self, result: StageResult, network: nn.Module, batch_size: int) -> StageResult:
         """Put the best weights into the checkpoint, in place of the last ones."""
-        checkpoint = result.outputs[0]
+        checkpoint = Path(result.outputs[0])
         info: CheckpointInfo = read_info(checkpoint)
         if self.step >= 0:
             network.load_state_dict(load_file(self.weights))

@@ -90,7 +90,7 @@ class _Worker:
         code = self.process.exitcode
         how = f"by {signal.Signals(-code).name}" if code is not None and code < 0 else f"with exit code {code}"
         advice = "; if memory ran out, use fewer --workers" if code == -signal.SIGKILL else ""
-        return f"{self.task.parts[0]}: its worker process ended {how}{advice}; run again to try it once more"
+        return f"{self.task.log}: its worker process ended {how}{advice}; run again to try it once more"
 
 
 def _start(context: SpawnContext, run: RunTask, task: LogTask) -> _Worker:
