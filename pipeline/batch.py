@@ -124,7 +124,7 @@ def run_task(task: LogTask, progress: Progress) -> LogOutcome:
             for number, (_, stage) in enumerate(_STAGES):
                 finished.append(stage(task, progress.part(number / len(_STAGES), (number + 1) / len(_STAGES))))
     except CadenceError as error:
-        message, code = str(error), error.exit_code
+        message, code = _naming(task, str(error)), error.exit_code
     except MemoryError:
         message, code = f"{task.log}: out of memory; use fewer --workers", DeviceError.exit_code
     except Exception as error:  # a defect met by one log of a long batch must not cost the results of the others
@@ -153,6 +153,12 @@ def exit_code(outcomes: Sequence[LogOutcome]) -> int:
     return max((outcome.exit_code for outcome in outcomes), default=0)
 
 
+def _naming(task: LogTask, message: str) -> str:
+    """The message with the log in front, where it does not say which one it is about."""
+    is_named = task.directory in message or any(part.rpartition("/")[2] in message for part in task.parts)
+    return message if is_named else f"{task.parts[0]}: {message}"
+
+
 @contextlib.contextmanager
 def _threads(count: int) -> Iterator[None]:
     before = torch.get_num_threads()
@@ -164,7 +170,9 @@ def _threads(count: int) -> Iterator[None]:
 
 
 def _ingest(task: LogTask, progress: Progress) -> StageResult:
-    return ingest(Path(task.parts[0]), Path(task.directory), task.config.ingest, progress, task.force)
+    parts = [Path(part) for part in task.parts]
+    log = parts if len(parts) > 1 else parts[0]
+    return ingest(log, Path(task.directory), task.config.ingest, progress, task.force)
 
 
 def _extract(task: LogTask, progress: Progress) -> StageResult:

@@ -62,7 +62,7 @@ def test_a_bad_log_does_not_stop_the_others(calls, tmp_path, capsys):
     calls.failing = {("extract", "b"): InputError("b.mcap: no detections"), ("export", "c"): DeviceError("disk full")}
     outcomes = run_here("abcd", tmp_path)
     assert [len(outcome.stages) for outcome in outcomes] == [5, 1, 3, 5]
-    assert [outcome.message for outcome in outcomes] == ["", "b.mcap: no detections", "disk full", ""]
+    assert [outcome.message for outcome in outcomes] == ["", "b.mcap: no detections", "c.mcap: disk full", ""]
     assert exit_code(outcomes) == 5
     assert capsys.readouterr() == ("", "")
 
