@@ -1,4 +1,4 @@
-"""Pictures of the paper's two worlds: the map, a hundred episodes, and what is known of the places.
+"""Pictures of the paper's worlds: the map, many episodes, and what is known of the places.
 
 python benchmarks/world_pictures.py --publish docs/images
 """
@@ -11,10 +11,10 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patches import Circle
+from matplotlib.patches import Circle, Polygon
 from PIL import Image
 
-from cadence.worlds import narco, ocean, prison, prison_map
+from cadence.worlds import narco, ocean, prison, prison_map, rendezvous, rendezvous_map
 from cadence.worlds.recordings import Recordings
 
 NUM_EPISODES = 100
@@ -77,6 +77,43 @@ def draw_prison() -> Figure:
     return figure
 
 
+def draw_rendezvous() -> Figure:
+    """Cover, mountains, goals and sites; many tracks, and beside them one episode with a meeting and one without."""
+    place = rendezvous_map.ground()
+    joint = rendezvous.simulate_rendezvous_batch(rendezvous.RendezvousConfig(), 0, np.arange(NUM_EPISODES))
+    figure, plots = plt.subplots(1, 3, figsize=(13.0, 5.0), layout="constrained", sharey=True)
+    meeting, direct = (int(np.flatnonzero(joint.is_meeting == wanted)[2]) for wanted in (True, False))
+    half = rendezvous_map.SIDE_M / 2000.0
+    for axes in plots:
+        axes.imshow(place.cover, origin="lower", extent=(-half, half, -half, half), cmap=plt.get_cmap("YlGn", 12), alpha=0.8)
+        for polygon in place.terrain.polygons_m:
+            axes.add_patch(Polygon(polygon / 1000.0, fc="#8d8478", ec=_INK, lw=0.6))
+        for x, y, radius in place.terrain.circles_m / 1000.0:
+            axes.add_patch(Circle((x, y), radius, fc="#8d8478", ec=_INK, lw=0.6))
+        axes.plot(*rendezvous_map.GOALS_M.T / 1000.0, "*", color=_GOAL, mec="white", mew=0.6, ms=13, label="goals")
+        axes.plot(*rendezvous_map.SITES_M.T / 1000.0, "D", color=_VIA, mec="white", mew=0.6, ms=7, label="meeting sites")
+        axes.set(xlabel="east [km]", xlim=(-half, half), ylim=(-half, half))
+    draw_tracks(plots[0], joint.recordings, 1000.0)
+    titles = ("World rendezvous: cover and tracks", "An episode with a meeting", "An episode without")
+    plots[0].set(ylabel="north [km]")
+    for axes, title, episode in zip(plots, titles, (None, meeting, direct), strict=True):
+        axes.set_title(title, fontsize=10)
+        if episode is not None:
+            _draw_agents(axes, joint.recordings.select([episode]))
+    handles, labels = plots[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", fontsize=8, ncols=4)
+    return figure
+
+
+def _draw_agents(axes: Axes, episode: Recordings) -> None:
+    """Each agent's track, start and detections in a colour of its own."""
+    for begin, end, color in zip(episode.offset[:-1], episode.offset[1:], (_INK, _CAUGHT, _VIA), strict=True):
+        place = episode.position_m[begin:end] / 1000.0
+        axes.plot(*place.T, color=color, lw=1.4)
+        axes.plot(*place[0], "o", color=color, ms=6)
+        axes.plot(*place[episode.is_detected[begin:end]].T, ".", color=_SEEN, mec=color, mew=0.7, ms=7)
+
+
 def save(figure: Figure, path: Path) -> None:
     """Write a figure as a PNG of 256 colours, which keeps it small."""
     buffer = io.BytesIO()
@@ -89,13 +126,14 @@ def save(figure: Figure, path: Path) -> None:
 
 
 def main() -> None:
-    """Draw both worlds."""
+    """Draw the worlds."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--publish", type=Path, required=True, help="folder for the pictures")
     folder = parser.parse_args().publish
     folder.mkdir(parents=True, exist_ok=True)
     save(draw_narco(), folder / "world-narco.png")
     save(draw_prison(), folder / "world-prison.png")
+    save(draw_rendezvous(), folder / "world-rendezvous.png")
 
 
 if __name__ == "__main__":
