@@ -20,14 +20,17 @@ from pipeline.ingest import CATALOGUE_NAME, open_catalogued_log, read_catalogue
 from pipeline.logs.reader import MissionLog
 from pipeline.manifest import StageResult, run_stage
 from pipeline.obstacles import OBSTACLES_NAME, ObstacleSources, collect_obstacles, write_obstacles
-from pipeline.placement import mission_frame, place
+from pipeline.placement import Placing, bring_together, in_enu, mission_frame, place
 from pipeline.positions import ChannelReader, Positions, Rows, read_positions
 from pipeline.progress import Progress
-from pipeline.selection import ROLES, select_readers
+from pipeline.selection import ROLES, select_readers, selected_channels
 from pipeline.sources import SourceConfig
 from pipeline.spikes import is_spike
+from pipeline.stamps import moment_ns
 from pipeline.tables import Frame, write_table
 from pipeline.thinning import ThinningConfig, is_seen, noise
+from pipeline.transform_messages import has_transforms, read_transforms
+from pipeline.transforms import Limits, TransformTree
 from schemas.tables import DETECTIONS, POSES, TRUTH
 
 _STAMPS_APART_S = 3600.0
@@ -41,7 +44,12 @@ class ExtractConfig:
     suggest          fill roles that are left empty by what the names of topics suggest
     thinning         make sparse detections out of a dense channel
     simultaneity_s   detections of one agent within this time are collapsed into one
-    start_s, end_s   use only this part of the mission, in seconds after the log's first message
+    topics           patterns ("/radar/*"); take positions only from topics that fit one of them; empty: from all
+    start, end       use only messages logged in this part: seconds after the log's first message, or a moment (ISO 8601)
+    frame            name of the fixed frame to bring detections into, by the log's transforms; by default their own where it
+                     does not move, else the one that it moves in
+    max_extrapolation_s   how long before its first and after its last sample a transform holds; later positions are refused
+    max_transform_gap_s   longest time between two samples over which a transform is interpolated
     default_sigma_m  standard deviation of detections that state none; without it they count as exact
     max_speed_mps    single positions that could only be reached and left again faster are recorder faults (see `spikes`)
     datum            [latitude, longitude] in degrees of x = y = 0; by default the median of all positions, and unknown for
@@ -55,8 +63,12 @@ class ExtractConfig:
     suggest: bool = True
     thinning: ThinningConfig = field(default_factory=ThinningConfig)
     simultaneity_s: float = 0.001
-    start_s: float | None = None
-    end_s: float | None = None
+    topics: tuple[str, ...] = ()
+    start: float | str | None = None
+    end: float | str | None = None
+    frame: str | None = None
+    max_extrapolation_s: float = 0.5
+    max_transform_gap_s: float = 10.0
     default_sigma_m: float | None = None
     max_speed_mps: float | None = 1000.0
     datum: tuple[float, float] | None = None
@@ -69,8 +81,12 @@ class ExtractConfig:
             raise ValueError("default_sigma_m must be positive")
         if self.max_speed_mps is not None and not self.max_speed_mps > 0:
             raise ValueError("max_speed_mps must be positive")
-        if self.start_s is not None and self.end_s is not None and not self.start_s < self.end_s:
-            raise ValueError("start_s must be smaller than end_s")
+        if not (0 <= self.max_extrapolation_s < np.inf and 0 < self.max_transform_gap_s < np.inf):
+            raise ValueError("max_extrapolation_s must not be negative, and max_transform_gap_s must be positive")
+        for name in ("start", "end"):
+            value = getattr(self, name)
+            if value is not None and moment_ns(value, 0) is None:
+                raise ValueError(f'{name} = {value!r}: expected seconds after the start of the log, or "2024-05-01T12:30:00Z"')
         if self.datum is not None and not (abs(self.datum[0]) <= 90 and abs(self.datum[1]) <= 180):
             raise ValueError(f"datum {list(self.datum)}: expected [latitude, longitude] in degrees")
 
@@ -92,15 +108,17 @@ def extract(directory: Path, config: ExtractConfig, progress: Progress, force: b
 def write_tables(log: MissionLog, folder: Path, config: ExtractConfig, progress: Progress) -> dict[str, Any]:
     """Write the files of the stage for `log` into `folder`; the summary."""
     stated = {"detections": config.detections, "truth": config.truth, "poses": config.poses}
+    transforms = _Transforms(log, progress)
     with _about(log):
-        readers = select_readers(stated, config.suggest, config.thinning, log.channels)
-    counts = read_positions(log, readers, progress)
-    with _about(log):
-        rows, frame = _rows_in_frame(log, readers, config, counts)
+        channels = selected_channels(log.channels, config.topics)
+        readers = select_readers(stated, config.suggest, config.thinning, channels)
+        counts = read_positions(log, readers, progress, *_cut_ns(log, config))
+        rows, frame = _rows_in_frame(readers, config, counts, transforms)
+    counts["unselected_topics"] = len({c.topic for c in log.channels} - {c.topic for c in channels})
     detections = collapse(_with_default_sigma(rows["detections"], config.default_sigma_m), config.simultaneity_s)
     counts["collapsed"] = len(rows["detections"]) - len(detections.positions)
     truth, counts["duplicate_truth"] = _without_repeats(rows["truth"])
-    log_id = log.path.stem
+    log_id = log.name
     write_table(_detection_table(log_id, detections), folder / "detections.parquet", "detections", frame)
     if len(truth):
         write_table(_track_table(log_id, truth, "agent_id", truth.agent, TRUTH), folder / "truth.parquet", "truth", frame)
@@ -110,7 +128,8 @@ def write_tables(log: MissionLog, folder: Path, config: ExtractConfig, progress:
     obstacles = collect_obstacles(log, config.obstacles, frame, progress.note)
     write_obstacles(folder / OBSTACLES_NAME, obstacles)
     _tell(counts, detections.positions, log, progress)
-    return _summary(log, readers, detections.positions, truth, poses, frame, counts, len(obstacles))
+    summary = _summary(log, readers, detections.positions, truth, poses, frame, counts, len(obstacles))
+    return summary | {"transforms": transforms.summary(counts)}
 
 
 @contextlib.contextmanager
@@ -122,13 +141,53 @@ def _about(log: MissionLog) -> Iterator[None]:
         raise InputError(f"{log.path}: {error}") from error
 
 
+def _cut_ns(log: MissionLog, config: ExtractConfig) -> tuple[int | None, int | None]:
+    """First log time that is used, and the first after it that is not."""
+    start = None if config.start is None else moment_ns(config.start, log.start_ns)
+    end = None if config.end is None else moment_ns(config.end, log.start_ns)
+    if start is not None and end is not None and end < start:
+        raise ConfigError(f"extract.start {config.start!r} lies after extract.end {config.end!r}; correct them")
+    return start, None if end is None else end + 1
+
+
+class _Transforms:
+    """The log's transforms, read at the first need."""
+
+    def __init__(self, log: MissionLog, progress: Progress) -> None:
+        self._log, self._progress = log, progress
+        self._tree = TransformTree()
+        self.counts: Counter[str] = Counter()
+
+    def read(self) -> TransformTree:
+        """The trees; empty ones for a log without transforms."""
+        if not self._tree.links and has_transforms(self._log.channels):
+            self._tree = read_transforms(self._log, self.counts, self._progress)
+            for problem in self._tree.problems:
+                self._progress.note(f"extract: {problem}")
+        return self._tree
+
+    def summary(self, counts: Counter[str]) -> dict[str, Any]:
+        """What was moved, what could not be, and what is wrong with the transforms."""
+        names = ("transformed", "no_transform", "bad_transforms", "undecodable_transforms")
+        both = counts + self.counts
+        return {
+            "num_frames": len(self._tree.links),
+            "problems": list(self._tree.problems),
+            **{name: both[name] for name in names},
+        }
+
+
 def _rows_in_frame(
-    log: MissionLog, readers: Sequence[ChannelReader], config: ExtractConfig, counts: Counter[str]
+    readers: Sequence[ChannelReader], config: ExtractConfig, counts: Counter[str], transforms: _Transforms
 ) -> tuple[dict[str, Positions], Frame]:
     """The rows of every role, placed in the mission frame and thinned, and that frame."""
-    rows = {role: _columns(role, readers, log, config, counts) for role in ROLES}
+    rows = {role: _columns(role, readers, counts) for role in ROLES}
     primary = "truth" if config.thinning.enabled and config.thinning.thin_from == "truth" else "detections"
     _check_any(primary, rows[primary], counts)
+    placing = Placing(config.frame, Limits(config.max_extrapolation_s, config.max_transform_gap_s))
+    rows = bring_together(rows, primary, placing, transforms.read, counts)
+    _check_any(primary, rows[primary], counts)
+    rows = {role: in_enu(positions) for role, positions in rows.items()}
     frame = mission_frame(rows[primary], [rows[role] for role in ROLES if role != primary], config.datum)
     for role in ROLES:
         rows[role] = _without_spikes(_placed(role, rows[role], frame, counts), config.max_speed_mps, counts)
@@ -139,32 +198,27 @@ def _rows_in_frame(
     return rows, frame
 
 
-def _columns(
-    role: str, readers: Sequence[ChannelReader], log: MissionLog, config: ExtractConfig, counts: Counter[str]
-) -> Positions:
-    """All finite rows of a role inside the time cut, sorted by time."""
+def _columns(role: str, readers: Sequence[ChannelReader], counts: Counter[str]) -> Positions:
+    """All finite rows of a role, sorted by time."""
     parts = [reader.finish() for reader in readers if reader.role == role]
     counts["out_of_order"] += sum(int((part.time_ns < np.maximum.accumulate(part.time_ns)).sum()) for part in parts)
-    rows = Positions.concatenate(parts or [Rows().finish("", False, False)])
+    rows = Positions.concatenate(parts or [Rows().finish()])
     is_finite = np.isfinite(rows.first) & np.isfinite(rows.second)
     # A latitude off the earth is as little a position as NaN.
     is_finite &= ~rows.is_geodetic | ((np.abs(rows.first) <= 90) & (np.abs(rows.second) <= 360))
     counts["dropped_nonfinite"] += int((~is_finite).sum())
-    counts[f"finite_{role}"] = int(is_finite.sum())
-    after_s = (rows.time_ns - log.start_ns) * 1e-9
-    is_inside = (after_s >= (-np.inf if config.start_s is None else config.start_s)) & (
-        after_s <= (np.inf if config.end_s is None else config.end_s)
-    )
-    counts["outside_time_cut"] += int((is_finite & ~is_inside).sum())
-    rows = rows[is_finite & is_inside]
+    rows = rows[is_finite]
     return rows[np.argsort(rows.time_ns, kind="stable")]
 
 
 def _check_any(role: str, rows: Positions, counts: Counter[str]) -> None:
     if len(rows):
         return
-    if counts[f"finite_{role}"]:
-        reason = "no detection lies inside extract.start_s and extract.end_s; widen them"
+    if counts["no_transform"]:
+        reason = (
+            f"for none of the {role} the log has a transform near enough in time; "
+            "raise extract.max_extrapolation_s and extract.max_transform_gap_s, or check the stamps"
+        )
     elif counts["dropped_nonfinite"]:
         reason = "every position is NaN, infinite or off the earth; check the recorder, or map another topic"
     elif counts["undecodable"]:
@@ -173,6 +227,8 @@ def _check_any(role: str, rows: Positions, counts: Counter[str]) -> None:
         reason = "every position is marked as having no fix; map another topic (cadence info lists them)"
     elif counts["incomplete"]:
         reason = "no message of the mapped topics has a position where the mapping looks for it; correct the [extract] entries"
+    elif counts["outside_time_cut"]:
+        reason = "no message of the mapped topics lies inside extract.start and extract.end; widen them"
     else:
         reason = f"the topics mapped as {role} hold no message; map another topic (cadence info lists them)"
     raise InputError(reason)
@@ -183,8 +239,8 @@ def _placed(role: str, rows: Positions, frame: Frame, counts: Counter[str]) -> P
     placed, num_elsewhere = place(rows, frame)
     if num_elsewhere and rows.is_stated.any():
         raise InputError(
-            f"{role}: {num_elsewhere} positions are not in the mission frame {frame.frame_id!r}, and transforms are not "
-            f"applied; take those topics out of [[extract.{role}]]"
+            f"{role}: {num_elsewhere} positions are not in the mission frame {frame.frame_id!r}, and no transform of the log "
+            f"joins them; take those topics out of [[extract.{role}]]"
         )
     counts["other_frame"] += num_elsewhere
     return placed
@@ -268,7 +324,10 @@ def _tell(counts: Counter[str], detections: Positions, log: MissionLog, progress
         "bad_covariance": "covariances are not positive definite and were replaced by the default",
         "out_of_order": "time stamps were out of order and were sorted",
         "spikes": "positions lie far off their track (see extract.max_speed_mps) and were skipped",
-        "other_frame": "positions are in another frame than the detections and were skipped",
+        "other_frame": "positions are in another frame than the detections, which no transform joins, and were skipped",
+        "no_transform": "positions have no transform near enough in time (see extract.max_extrapolation_s) and were skipped",
+        "outside_time_cut": "messages lie outside extract.start and extract.end and were not used",
+        "unselected_topics": "topics fit none of extract.topics and were not used",
     }
     for name, meaning in meanings.items():
         if counts[name]:
@@ -298,7 +357,10 @@ def _summary(
         "span_s": span_s,
         "frame": {"frame_id": frame.frame_id, "latitude_deg": frame.latitude_deg, "longitude_deg": frame.longitude_deg},
         "sources": {role: sorted({r.source.topic for r in readers if r.role == role}) for role in ROLES},
-        **{name: counts[name] for name in (*names, "other_frame", "spikes", "collapsed", "duplicate_truth")},
+        **{
+            name: counts[name]
+            for name in (*names, "other_frame", "spikes", "collapsed", "duplicate_truth", "unselected_topics")
+        },
         "lost_spans_ns": [list(span) for span in log.health.lost_spans_ns],
         "is_complete": log.health.is_complete,
     }

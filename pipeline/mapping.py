@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Final, Literal
 
-from pipeline.presets import normalise_schema, preset_for
+from pipeline.presets import NAMES_AGENTS, normalise_schema, preset_for
 from pipeline.sources import ChannelLike, SourceConfig
 
 Role = Literal["detections", "truth", "poses", "positions", "tf", "obstacles"]
@@ -27,8 +27,10 @@ _POSE = {
 }  # fmt: skip
 _KNOWN: Final = _TRUTH | _DETECTION | _POSE | {"ground"}
 _OBSTACLE = {"obstacle", "obstacles", "map", "costmap", "grid", "keepout", "nogo"}
-_TF_SCHEMAS = {"TFMessage", "FrameTransform", "FrameTransforms"}
+_TF_SCHEMAS = {"TFMessage", "tfMessage", "TransformStamped", "FrameTransform", "FrameTransforms"}
 _OBSTACLE_SCHEMAS = {"OccupancyGrid", "Grid", "GeoJSON"}
+OWN_TOPICS = "/cadence/"
+"""What an earlier run wrote into a combined file is never an input."""
 # Without a preset only a name as plain as this makes a detection: /radar/image or /battery/report are none.
 _PLAIN_DETECTION = {"contact", "contacts", "detection", "detections", "target", "targets", "sighting", "sightings"}
 _NEVER_POSITIONS = {"std_msgs", "sensor_msgs", "rcl_interfaces", "diagnostic_msgs", "visualization_msgs"}
@@ -99,16 +101,20 @@ def _role(channel: ChannelLike) -> Role | None:
     words, preset = _words(channel.topic), preset_for(channel.schema_name)
     if kind in _TF_SCHEMAS:
         return "tf"
-    if kind in _OBSTACLE_SCHEMAS:
+    if kind in _OBSTACLE_SCHEMAS or (preset == "SceneUpdate" and _OBSTACLE.intersection(words)):
         return "obstacles"
+    if channel.topic.startswith(OWN_TOPICS):
+        return None
     if preset is None:
         if _PLAIN_DETECTION.intersection(words) and package not in _NEVER_POSITIONS:
             return "detections"
         return "obstacles" if _OBSTACLE.intersection(words) and package not in _NEVER_POSITIONS else None
     if _TRUTH.intersection(words) or ("ground", "truth") in itertools.pairwise(words):
         return "truth"
-    if preset in ("Detection", "Detection3DArray") or _DETECTION.intersection(words):
+    if _DETECTION.intersection(words) or preset == "Detection" or (preset in NAMES_AGENTS and preset != "SceneUpdate"):
         return "detections"
+    if preset == "SceneUpdate":
+        return None  # a scene without such a name may show anything
     return "poses" if _POSE.intersection(words) else "positions"
 
 
@@ -163,7 +169,7 @@ def _name_only_agent(
     ]
     if len(truth) != 1 or len(named) != 1:
         return detections
-    identified = {c.topic for c in channels if b"agent_id" in c.schema_data or preset_for(c.schema_name) == "Detection3DArray"}
+    identified = {c.topic for c in channels if b"agent_id" in c.schema_data or preset_for(c.schema_name) in NAMES_AGENTS}
     is_named = [source.topic in identified or "{agent}" in source.topic for source in detections]
     return tuple(s if known else replace(s, agent=named[0]) for s, known in zip(detections, is_named, strict=True))
 

@@ -1,19 +1,28 @@
 """Message paths in Foxglove's syntax: `detections[:]{score>=0.5}.bbox.center.position.x`.
 
 The topic is not part of a path here. Fields by name (quoted where they hold other characters), `[i]` with negative indices
-from the end, `[a:b]` with both ends included (as Foxglove has it, unlike Python), and filters `{field==value}`
-(`== != < <= > >=`) that keep the matching items. A path gives a list: one value, or one an item after a slice.
+from the end, `[a:b]` with both ends included (as Foxglove has it, unlike Python), filters `{field==value}`
+(`== != < <= > >=`; several mean "and") that keep the matching items, and at the end functions of numbers (`.@mul(1e-7)`).
+A value in a filter is a number, true, false, text, or the name of a constant (`{type==KNOWN}`).
+
+A path finds values at places: a place has a number for each slice of the path, the item's index. So values of different
+paths are of one item where their places are equal, and `entities[:].id` belongs to all of `entities[:].cubes[:].pose`.
 """
 
+import functools
+import math
 import operator
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+Place = tuple[int, ...]
+
 _FIELD = re.compile(r'"([^"]+)"|([A-Za-z_][\w\-]*)')
+_FUNCTION = re.compile(r"@(\w+)(?:\(\s*([^()]*?)\s*\))?")
 _BRACKET = re.compile(r"\[(-?\d*)(:?)(-?\d*)\]")
-_FILTER = re.compile(r"\{\s*([A-Za-z_][\w\-.]*)\s*(==|!=|<=|>=|<|>)\s*([^{}]+?)\s*\}")
+_FILTER = re.compile(r"""\{\s*([A-Za-z_][\w\-.]*)\s*(==|!=|<=|>=|<|>)\s*("[^"]*"|'[^']*'|[^{}"']+?)\s*\}""")
 _OPERATORS: Mapping[str, Callable[[Any, Any], bool]] = {
     "==": operator.eq,
     "!=": operator.ne,
@@ -22,6 +31,12 @@ _OPERATORS: Mapping[str, Callable[[Any, Any], bool]] = {
     "<": operator.lt,
     ">": operator.gt,
 }
+_PLAIN_FUNCTIONS: Mapping[str, Callable[[float], float]] = {
+    "abs": abs, "negative": operator.neg, "deg2rad": math.radians, "rad2deg": math.degrees, "round": round,
+}  # fmt: skip
+_FUNCTIONS_OF_TWO: Mapping[str, Callable[[float, float], float]] = {
+    "add": operator.add, "sub": operator.sub, "mul": operator.mul, "div": operator.truediv,
+}  # fmt: skip
 
 
 class MissingFieldError(LookupError):
@@ -34,9 +49,9 @@ class Field:
 
     name: str
 
-    def apply(self, items: list[Any]) -> list[Any]:
-        """The field of every item."""
-        return [_field(item, self.name) for item in items]
+    def of(self, item: Any) -> Any:
+        """The field of an item."""
+        return _field(item, self.name)
 
 
 @dataclass(frozen=True)
@@ -45,12 +60,27 @@ class Index:
 
     index: int
 
-    def apply(self, items: list[Any]) -> list[Any]:
-        """The element of every item, which must be an array."""
+    def of(self, item: Any) -> Any:
+        """The element of an array."""
         try:
-            return [item[self.index] for item in items]
+            return item[self.index]
         except (IndexError, KeyError, TypeError) as error:
             raise MissingFieldError(f"no element [{self.index}]") from error
+
+
+@dataclass(frozen=True)
+class Function:
+    """`.@name` or `.@name(number)`."""
+
+    name: str
+    function: Callable[[float], float]
+
+    def of(self, item: Any) -> Any:
+        """The number that the function makes of a number."""
+        try:
+            return self.function(item)
+        except (TypeError, ValueError, OverflowError) as error:
+            raise MissingFieldError(f"@{self.name} of something that is not a number") from error
 
 
 @dataclass(frozen=True)
@@ -60,12 +90,12 @@ class Slice:
     first: int | None
     last: int | None
 
-    def apply(self, items: list[Any]) -> list[Any]:
-        """All elements in the range, of all items, in order."""
+    def elements(self, item: Any) -> Iterable[tuple[int, Any]]:
+        """Index and value of all elements of an array in the range."""
         # Foxglove includes the last element, so Python's stop lies one behind it; behind -1 there is no stop.
         stop = None if self.last is None or self.last == -1 else self.last + 1
         try:
-            return [element for item in items for element in item[self.first : stop]]
+            return [(index, item[index]) for index in range(len(item))[self.first : stop]]
         except (KeyError, TypeError) as error:
             raise MissingFieldError("a slice of something that is not an array") from error
 
@@ -78,20 +108,32 @@ class Filter:
     symbol: str
     value: str | float | bool
 
-    def apply(self, items: list[Any]) -> list[Any]:
-        """The items that match; one without the field, or of another type, does not."""
-        return [item for item in items if self._matches(item)]
-
-    def _matches(self, item: Any) -> bool:
+    def keeps(self, item: Any) -> bool:
+        """Whether an item matches; one without the field, or of another type, does not."""
+        parent = item
         try:
             for name in self.names:
-                item = _field(item, name)
-            return bool(_OPERATORS[self.symbol](item, self.value))
+                parent, item = item, _field(item, name)
+            value = self._constant(parent, item) if isinstance(self.value, str) and isinstance(item, int) else self.value
+            return bool(_OPERATORS[self.symbol](item, value))
         except (MissingFieldError, TypeError):
             return self.symbol == "!="
 
+    def _constant(self, parent: Any, item: int) -> Any:
+        """The number that the text names: a constant of the message (ROS) or a value of the field's enumeration."""
+        word = str(self.value)
+        if getattr(item, "name", None) == word:  # flatbuffer
+            return item
+        descriptor = getattr(parent, "DESCRIPTOR", None)
+        known = descriptor.fields_by_name.get(self.names[-1]) if descriptor is not None else None
+        if known is not None and known.enum_type is not None:
+            value = known.enum_type.values_by_name.get(word)
+            return self.value if value is None else value.number
+        constant = None if isinstance(parent, dict) else getattr(type(parent), word, None)
+        return constant if isinstance(constant, int) else self.value
 
-Step = Field | Index | Slice | Filter
+
+Step = Field | Index | Function | Slice | Filter
 
 
 @dataclass(frozen=True)
@@ -104,14 +146,54 @@ class MessagePath:
     @property
     def is_plural(self) -> bool:
         """Whether the path may give any number of values (it holds a slice or a filter)."""
-        return any(isinstance(step, Slice | Filter) for step in self.steps)
+        return self._chain is None
+
+    @functools.cached_property
+    def _chain(self) -> tuple[Callable[[Any], Any], ...] | None:
+        """The steps one after the other, where each gives one value."""
+        chain = tuple(step.of for step in self.steps if not isinstance(step, Slice | Filter))
+        return chain if len(chain) == len(self.steps) else None
+
+    def located(self, message: Any) -> dict[Place, Any]:
+        """What the path finds in a decoded message (attributes or dicts), by place.
+
+        Items that lack a field are left out; `MissingFieldError` where nothing is left for that reason alone.
+        """
+        if self._chain is not None:
+            for follow in self._chain:
+                message = follow(message)
+            return {(): message}
+        items: dict[Place, Any] = {(): message}
+        missing: MissingFieldError | None = None
+        for step in self.steps:
+            kept: dict[Place, Any] = {}
+            for place, item in items.items():
+                try:
+                    if isinstance(step, Slice):
+                        kept.update(((*place, index), element) for index, element in step.elements(item))
+                    elif not isinstance(step, Filter):
+                        kept[place] = step.of(item)
+                    elif step.keeps(item):
+                        kept[place] = item
+                except MissingFieldError as error:
+                    missing = error
+            items = kept
+        if not items and missing is not None:
+            raise missing
+        return items
 
     def values(self, message: Any) -> list[Any]:
-        """What the path finds in a decoded message (attributes or dicts); `MissingFieldError` where it leads nowhere."""
-        items = [message]
-        for step in self.steps:
-            items = step.apply(items)
-        return items
+        """The values without their places; errors as in `located`."""
+        return list(self.located(message).values())
+
+
+def at_place(values: Mapping[Place, Any], place: Place) -> Any:
+    """The value of the item at `place`, or of what holds the item; None where there is none."""
+    while place not in values:
+        if not place:
+            return None
+        place = place[:-1]
+    return values[place]
 
 
 def parse_path(text: str) -> MessagePath:
@@ -126,6 +208,8 @@ def parse_path(text: str) -> MessagePath:
             step, position = _bracket(text, position)
         elif character == "{":
             step, position = _filter(text, position)
+        elif text.startswith((".@", "@"), position):
+            step, position = _function(text, position + (character == "."))
         elif character == "." or position == 0:
             step, position = _name(text, position + (character == "."))
         else:
@@ -143,10 +227,29 @@ def _name(text: str, position: int) -> tuple[Step, int]:
     return Field(match[1] or match[2]), match.end()
 
 
+def _function(text: str, position: int) -> tuple[Step, int]:
+    match = _FUNCTION.match(text, position)
+    name = match[1] if match is not None else ""
+    if match is not None and match[2] is None and name in _PLAIN_FUNCTIONS:
+        return Function(name, _PLAIN_FUNCTIONS[name]), match.end()
+    if match is None or name not in _FUNCTIONS_OF_TWO:
+        known = ", ".join([f"@{known}" for known in _PLAIN_FUNCTIONS] + [f"@{known}(number)" for known in _FUNCTIONS_OF_TWO])
+        raise _wrong(text, position, f"expected one of {known}")
+    try:
+        operand = float(match[2] or "")
+    except ValueError as error:
+        raise _wrong(text, position, f"expected a number in @{name}(...)") from error
+    if name == "div" and operand == 0:
+        raise _wrong(text, position, "expected another number than 0")
+    function = _FUNCTIONS_OF_TWO[name]
+    return Function(name, lambda value: function(value, operand)), match.end()
+
+
 def _bracket(text: str, position: int) -> tuple[Step, int]:
     match = _BRACKET.match(text, position)
     if match is None or "-" in (match[1], match[3]) or (not match[2] and not match[1]) or (not match[2] and match[3]):
-        raise _wrong(text, position, "expected [index], [:] or [first:last]")
+        advice = " (variables are not known here)" if "$" in text else ""
+        raise _wrong(text, position, f"expected [index], [:] or [first:last]{advice}")
     if not match[2]:
         return Index(int(match[1])), match.end()
     return Slice(int(match[1]) if match[1] else None, int(match[3]) if match[3] else None), match.end()
@@ -156,6 +259,8 @@ def _filter(text: str, position: int) -> tuple[Step, int]:
     match = _FILTER.match(text, position)
     if match is None:
         raise _wrong(text, position, 'expected a filter such as {score>=0.5} or {kind=="ship"}')
+    if match[3].startswith("$"):
+        raise _wrong(text, position, f"variables such as {match[3]} are not known here; expected a value")
     return Filter(tuple(match[1].split(".")), match[2], _literal(match[3])), match.end()
 
 
@@ -164,16 +269,20 @@ def _literal(text: str) -> str | float | bool:
         return text == "true"
     if len(text) >= 2 and text[0] == text[-1] and text[0] in "\"'":
         return text[1:-1]
-    try:
-        return float(text)
-    except ValueError:
-        return text
+    for kind in (int, float):  # as a float a long identity would lose its last digits
+        try:
+            return kind(text)
+        except ValueError:
+            continue
+    return text
 
 
 def _field(item: Any, name: str) -> Any:
     try:
         return item[name] if isinstance(item, dict) else getattr(item, name)
     except (KeyError, AttributeError) as error:
+        if hasattr(item, name + "_"):  # named like a Python keyword
+            return getattr(item, name + "_")
         known = field_names(item)
         hint = f"; fields there: {', '.join(known)}" if known else ""
         raise MissingFieldError(f"no field {name!r}{hint}") from error

@@ -6,7 +6,7 @@ One pass over the log serves all roles. What cannot be used is counted, never pa
 import math
 from array import array
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any, Self
 
@@ -14,9 +14,10 @@ import numpy as np
 import numpy.typing as npt
 
 from cadence.errors import ConfigError
+from pipeline.covariances import NONE_COVARIANCE, Covariance, isotropic, stated_covariance
 from pipeline.logs.decode import Decoder, UndecodableChannel, UndecodableMessage, decoder_for
 from pipeline.logs.reader import Channel, MissionLog, RawMessage
-from pipeline.message_path import MissingFieldError, parse_path
+from pipeline.message_path import MissingFieldError, Place, at_place, parse_path
 from pipeline.progress import Progress
 from pipeline.sources import LOG_TIME, PATH_KEYS, PUBLISH_TIME, SourceConfig, resolve_paths
 from pipeline.stamps import stamp_ns
@@ -24,7 +25,8 @@ from pipeline.stamps import stamp_ns
 Float64s = npt.NDArray[np.float64]
 Objects = npt.NDArray[np.object_]
 
-NONE_COVARIANCE = (math.nan, math.nan, math.nan)
+Point = tuple[Place, Any, Any, Any]
+"""Place in the message; x, y and z, or latitude, longitude and altitude, as the message has them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +34,9 @@ class Positions:
     """Columns of N rows. NaN and None stand for what a message does not state.
 
     first, second  x_m and y_m, or latitude_deg and longitude_deg where is_geodetic
-    covariance_m2  [N, 3] xx, xy, yy (east and north)
+    covariance_m2  [N, 3] xx, xy, yy
+    height_covariance_m2  [N, 3] xz, yz, zz: what a tilted sensor frame turns into those
+    is_ned         whether x is north, y east and z down in the frame that the positions end in
     is_stated      whether the user configured the source (else it was suggested)
     """
 
@@ -43,12 +47,14 @@ class Positions:
     second: Float64s
     z_m: Float64s
     covariance_m2: Float64s
+    height_covariance_m2: Float64s
     score: npt.NDArray[np.float32]
     agent: Objects
     sensor: Objects
     topic: Objects
     frame_id: Objects
     is_geodetic: npt.NDArray[np.bool_]
+    is_ned: npt.NDArray[np.bool_]
     is_stated: npt.NDArray[np.bool_]
 
     def __len__(self) -> int:
@@ -69,50 +75,58 @@ class Rows:
 
     def __init__(self) -> None:
         self.integers = array("q")  # time, log time, sequence
-        self.floats = array("d")  # first, second, z, xx, xy, yy, score
+        self.floats = array("d")  # first, second, z, score, covariance
         self.agents: list[str | None] = []
         self.sensors: list[str | None] = []
         self.frame_ids: list[str] = []
 
-    def finish(self, topic: str, is_geodetic: bool, is_stated: bool) -> Positions:
+    def finish(self, topic: str = "", is_geodetic: bool = False, is_ned: bool = False, is_stated: bool = False) -> Positions:
         """The columns as arrays."""
         integers = np.array(self.integers, dtype=np.int64).reshape(-1, 3)
-        floats = np.array(self.floats, dtype=np.float64).reshape(-1, 7)
+        floats = np.array(self.floats, dtype=np.float64).reshape(-1, 10)
         num_rows = len(integers)
         return Positions(
             integers[:, 0], integers[:, 1], integers[:, 2],
-            floats[:, 0], floats[:, 1], floats[:, 2], floats[:, 3:6], floats[:, 6].astype(np.float32),
+            floats[:, 0], floats[:, 1], floats[:, 2], floats[:, 4:7], floats[:, 7:], floats[:, 3].astype(np.float32),
             np.array(self.agents, dtype=object), np.array(self.sensors, dtype=object),
             np.full(num_rows, topic, dtype=object), np.array(self.frame_ids, dtype=object),
-            np.full(num_rows, is_geodetic), np.full(num_rows, is_stated),
+            np.full(num_rows, is_geodetic), np.full(num_rows, is_ned), np.full(num_rows, is_stated),
         )  # fmt: skip
 
 
 class FieldReader:
-    """Alternative message paths of one field; remembers the first that a message had."""
+    """Alternative message paths of one field; tries first the one that served the last message.
 
-    def __init__(self, texts: Iterable[str], is_needed: bool = False) -> None:
+    `convert` turns a value into what is kept, None where it is not filled in; then the next alternative is tried.
+    """
+
+    def __init__(self, texts: Iterable[str], is_needed: bool = False, convert: Callable[[Any], Any] | None = None) -> None:
         self.paths = [parse_path(text) for text in texts]
         self.is_needed = is_needed
-        self.found: int | None = None
+        self.is_found = False
         self.problem = ""
+        self._convert = convert
+        self._order = list(range(len(self.paths)))
 
-    def values(self, message: Any) -> list[Any] | None:
-        """The values, one or one an item; None where no alternative leads anywhere."""
-        if self.found is not None:
+    def located(self, message: Any) -> Mapping[Place, Any] | None:
+        """The values by place; None where no alternative leads anywhere."""
+        unfilled: Mapping[Place, Any] | None = None
+        for rank, number in enumerate(self._order):
             try:
-                return self.paths[self.found].values(message)
-            except MissingFieldError:
-                pass
-        for place, path in enumerate(self.paths):
-            try:
-                values = path.values(message)
+                values = self.paths[number].located(message)
             except MissingFieldError as error:
-                self.problem = f"path {path.text!r}: {error}"
+                self.problem = f"path {self.paths[number].text!r}: {error}"
                 continue
-            self.found = place
+            self.is_found = True
+            if self._convert is not None:
+                values = {place: self._convert(value) for place, value in values.items()}
+                if values and all(value is None for value in values.values()):
+                    unfilled = unfilled or values
+                    continue
+            if rank:
+                self._order.insert(0, self._order.pop(rank))
             return values
-        return None
+        return unfilled
 
 
 class ChannelReader:
@@ -123,126 +137,127 @@ class ChannelReader:
         self.channel, self.source, self.role, self.is_stated = channel, source, role, is_stated
         self.is_geodetic = bool(paths.latitude)
         self.names = {"agent": named.get("agent", source.agent), "sensor": named.get("sensor", source.sensor)}
-        self.fields = {item.name: self._field(item.name, getattr(paths, item.name)) for item in fields(paths)}
-        self.position = tuple(self.fields[name] for name in (_GEODETIC if self.is_geodetic else _METRIC))
-        self.sigma = NONE_COVARIANCE if source.sigma_m is None else (source.sigma_m**2, 0.0, source.sigma_m**2)
+        names = _GEODETIC if self.is_geodetic else _METRIC
+        alternatives = [getattr(paths, name) for name in names]
+        self.alternatives = paths.alternatives
+        if self.alternatives == "first":
+            self.positions = [tuple(self._field(name, texts) for name, texts in zip(names, alternatives, strict=True))]
+        else:
+            self.positions = [
+                tuple(self._field(name, (text,)) for name, text in zip(names, texts, strict=True))
+                for texts in zip(*alternatives, strict=True)
+            ]
+        self.fields = {name: self._field(name, getattr(paths, name)) for name in _OTHERS}
+        self.unknown = NONE_COVARIANCE if source.sigma_m is None else isotropic(source.sigma_m**2)
         self.rows = Rows()
         self.counts: Counter[str] = Counter()
 
     def _field(self, name: str, paths: Sequence[str]) -> FieldReader:
         """Fields that a constant replaces have no path; those that the user stated must be in some message."""
-        if name == "schemas" or self.names.get(name) is not None:
+        if self.names.get(name) is not None:
             return FieldReader(())
         if name == "time" and self.source.time in (LOG_TIME, PUBLISH_TIME):
             return FieldReader(())
         is_stated = getattr(self.source, PATH_KEYS.get(name, name), None) is not None
         is_position = name in ("x", "y", "latitude", "longitude") and self.source.preset is not None and self.is_stated
-        return FieldReader(paths, is_needed=bool(paths) and (is_stated or is_position))
+        return FieldReader(paths, bool(paths) and (is_stated or is_position), _CONVERSIONS.get(name))
 
     def read(self, message: Any, raw: RawMessage) -> None:
         """Append the positions of one decoded message, or count why there are none."""
         self.counts["messages"] += 1
-        firsts, seconds = self.position[0].values(message), self.position[1].values(message)
-        if firsts is None or seconds is None or len(firsts) != len(seconds):
+        points = self._points(message)
+        if points is None:
             self.counts["incomplete"] += 1
             return
-        num = len(firsts)
-        try:
-            columns = zip(
-                firsts, seconds, self._spread(self.position[2], message, num), self._covariances(message, num),
-                self._spread(self.fields["score"], message, num), self._times(message, raw, num),
-                self._names(message, num, "agent"), self._names(message, num, "sensor"),
-                self._spread(self.fields["frame_id"], message, num), self._spread(self.fields["status"], message, num),
-                strict=True,
-            )  # fmt: skip
-        except _LengthError:
-            self.counts["incomplete"] += 1
-            return
-        for first, second, z, covariance, score, time_ns, agent, sensor, frame_id, status in columns:
-            if status is not None and _number(status) < 0:
+        found = {name: reader.located(message) or {} if reader.paths else {} for name, reader in self.fields.items()}
+        default_ns = raw.publish_time_ns if self.source.time == PUBLISH_TIME else raw.log_time_ns
+        for place, first, second, z in points:
+            values = {name: at_place(located, place) if located else None for name, located in found.items()}
+            if self._has_no_fix(values):
                 self.counts["no_fix"] += 1
                 continue
+            covariance = self._covariance(values["covariance"], values["covariance_type"])
+            time_ns = default_ns if values["time"] is None else values["time"]
             self.rows.integers.extend((time_ns, raw.log_time_ns, raw.sequence))
-            self.rows.floats.extend((_number(first), _number(second), _number(z), *covariance, _number(score)))
-            self.rows.agents.append(agent)
-            self.rows.sensors.append(sensor)
-            self.rows.frame_ids.append(frame_id.lstrip("/") if isinstance(frame_id, str) else "")  # ROS 1 wrote /map
+            self.rows.floats.extend((_number(first), _number(second), _number(z), _number(values["score"]), *covariance))
+            self.rows.agents.append(self._identity("agent", values["agent"], place))
+            self.rows.sensors.append(self._identity("sensor", values["sensor"], place))
+            self.rows.frame_ids.append(values["frame_id"] or "")
 
     def check(self) -> None:
         """`ConfigError` where something that the user stated was in no message."""
-        for reader in self.fields.values():
-            if reader.is_needed and reader.found is None and self.counts["messages"]:
+        alternatives = [(reader,) for reader in self.fields.values()] + list(zip(*self.positions, strict=True))
+        for readers in alternatives:
+            if readers[0].is_needed and self.counts["messages"] and not any(reader.is_found for reader in readers):
                 where = f"extract.{self.role}, topic {self.channel.topic}"
-                raise ConfigError(f"{where}: no message has {reader.problem}; correct the [extract] entry")
+                raise ConfigError(f"{where}: no message has {readers[0].problem}; correct the [extract] entry")
 
     def finish(self) -> Positions:
         """All rows read."""
-        return self.rows.finish(self.channel.topic, self.is_geodetic, self.is_stated)
+        return self.rows.finish(self.channel.topic, self.is_geodetic, self.source.frame_convention == "ned", self.is_stated)
 
-    def _spread(self, reader: FieldReader, message: Any, num: int) -> list[Any]:
-        values = reader.values(message) if reader.paths else None
-        if values is None:
-            return [None] * num
-        if len(values) == num:
-            return values
-        if len(values) != 1:
-            raise _LengthError
-        return values * num
+    def _points(self, message: Any) -> list[Point] | None:
+        """All positions in a message; None where no path leads to any."""
+        found = [points for position in self.positions if (points := self._joined(position, message)) is not None]
+        if len(found) < 2:
+            return found[0] if found else None
+        if self.alternatives == "all":
+            return [point for points in found for point in points]
+        filled = {point[0]: point for points in reversed(found) for point in points if any(point[1:])}
+        return [filled.get(point[0], point) for point in found[0]]
 
-    def _times(self, message: Any, raw: RawMessage, num: int) -> list[int]:
-        default = raw.publish_time_ns if self.source.time == PUBLISH_TIME else raw.log_time_ns
-        return [
-            default if (stamp := stamp_ns(value)) is None else stamp
-            for value in self._spread(self.fields["time"], message, num)
-        ]
+    def _joined(self, position: Sequence[FieldReader], message: Any) -> list[Point] | None:
+        """The items that have both of the first two coordinates; the others are counted."""
+        firsts, seconds = position[0].located(message), position[1].located(message)
+        if firsts is None or seconds is None:
+            return None
+        zs = position[2].located(message) or {}
+        points = [(place, first, seconds[place], at_place(zs, place)) for place, first in firsts.items() if place in seconds]
+        self.counts["incomplete"] += len(firsts.keys() | seconds.keys()) - len(points)
+        return points
 
-    def _covariances(self, message: Any, num: int) -> list[tuple[float, float, float]]:
-        if not self.fields["covariance"].paths:
-            return [self.sigma] * num
-        kinds = self._spread(self.fields["covariance_type"], message, num)
-        matrices = self._spread(self.fields["covariance"], message, num)
-        return [self._covariance(matrix, kind) for matrix, kind in zip(matrices, kinds, strict=True)]
+    def _has_no_fix(self, values: Mapping[str, Any]) -> bool:
+        status, flags = values["status"], values["flags"]
+        return (status is not None and _number(status) < 0) or (isinstance(flags, int) and flags % 2 == 0)
 
-    def _covariance(self, matrix: Any, kind: Any) -> tuple[float, float, float]:
-        """xx, xy, yy; what is unknown, all zero or negative (as ROS states "unknown") takes the source's sigma_m."""
+    def _covariance(self, matrix: Any, kind: Any) -> Covariance:
+        """What is unknown takes the source's sigma_m; so does what is no covariance, which is counted."""
         if matrix is None or kind == 0 or (isinstance(kind, str) and "UNKNOWN" in kind):
-            return self.sigma
-        if isinstance(matrix, int | float):
-            matrix = (matrix, 0.0, 0.0, matrix)
-        if len(matrix) not in _PLACES:
-            return self.sigma
-        xx, xy, yy = (_number(matrix[place]) for place in _PLACES[len(matrix)])
-        if xx == yy == 0 or xx < 0 or yy < 0:
-            return self.sigma
-        if not (math.isfinite(xx) and math.isfinite(xy) and math.isfinite(yy) and xx * yy > xy * xy):
+            return self.unknown
+        try:
+            return stated_covariance(matrix) or self.unknown
+        except (LookupError, TypeError, ValueError, OverflowError):
             self.counts["bad_covariance"] += 1
-            return self.sigma
-        return xx, xy, yy
+            return self.unknown
 
-    def _names(self, message: Any, num: int, kind: str) -> list[str | None]:
+    def _identity(self, kind: str, value: Any, place: Place) -> str | None:
         """Constant, from a field, or None; truth and poses need a name, so theirs is at last the topic's (and the place)."""
         constant = self.names[kind]
-        if constant is not None:
-            return [constant] * num
-        names = [_name(value) for value in self._spread(self.fields[kind], message, num)]
-        if kind == {"truth": "agent", "poses": "sensor"}.get(self.role):
-            topic = self.channel.topic.strip("/") or self.role
-            places = [f"{topic}/{place}" for place in range(num)] if self.position[0].paths[0].is_plural else [topic] * num
-            return [place if name is None else name for name, place in zip(names, places, strict=True)]
-        return names
+        name = _name(value) if constant is None else constant
+        if name is not None or kind != {"truth": "agent", "poses": "sensor"}.get(self.role):
+            return name
+        topic = self.channel.topic.strip("/") or self.role
+        return "/".join([topic, *map(str, place)])
 
 
-class _LengthError(Exception):
-    """Paths of one source found different numbers of items in a message."""
+def _frame_name(value: Any) -> str | None:
+    return value.lstrip("/") or None if isinstance(value, str) else None  # ROS 1 wrote /map
 
 
-_PLACES: Mapping[int, tuple[int, int, int]] = {4: (0, 1, 3), 9: (0, 1, 4), 36: (0, 1, 7)}
 _METRIC = ("x", "y", "z")
 _GEODETIC = ("latitude", "longitude", "altitude")
+_OTHERS = ("covariance", "covariance_type", "status", "flags", "time", "frame_id", "agent", "sensor", "score")
+_CONVERSIONS: Mapping[str, Callable[[Any], Any]] = {"time": stamp_ns, "frame_id": _frame_name}
 
 
-def read_positions(log: MissionLog, readers: Sequence[ChannelReader], progress: Progress) -> Counter[str]:
-    """Feed all messages of the readers' channels to them; the counts of what could not be used."""
+def read_positions(
+    log: MissionLog,
+    readers: Sequence[ChannelReader],
+    progress: Progress,
+    start_ns: int | None = None,
+    end_ns: int | None = None,
+) -> Counter[str]:
+    """Feed the messages of the readers' channels with start_ns <= log time < end_ns to them; counts of what was not used."""
     counts: Counter[str] = Counter()
     by_channel: dict[int, list[ChannelReader]] = {}
     for reader in readers:
@@ -256,15 +271,17 @@ def read_positions(log: MissionLog, readers: Sequence[ChannelReader], progress: 
             progress.note(f"extract: {error}")
             del by_channel[number]
     topics = {reader.channel.topic for reader in readers}
+    num_read = 0
 
     def advance(num_bytes: int) -> None:
         bar.update(num_bytes)
 
     with progress.bar(log.size_bytes, "extract", unit="B", scale=True) as bar:
-        for raw in log.messages(topics=topics, on_bytes=advance):
+        for raw in log.messages(topics, advance, start_ns, end_ns):
             served = by_channel.get(raw.channel.id, [])
             if not served:
                 continue
+            num_read += 1
             try:
                 message = decoders[raw.channel.id](raw.data)
             except UndecodableMessage:
@@ -272,6 +289,8 @@ def read_positions(log: MissionLog, readers: Sequence[ChannelReader], progress: 
                 continue
             for reader in served:
                 reader.read(message, raw)
+    if start_ns is not None or end_ns is not None:
+        counts["outside_time_cut"] = sum(served[0].channel.message_count or 0 for served in by_channel.values()) - num_read
     for reader in readers:
         reader.check()
         counts.update(reader.counts)

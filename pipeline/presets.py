@@ -5,9 +5,10 @@ A preset is chosen by the schema's name, whatever the encoding: `geometry_msgs/m
 """
 
 from dataclasses import dataclass, replace
+from typing import Literal
 
 Paths = tuple[str, ...]
-"""Alternatives (a type's versions and flattened forms): the first that a message has is used."""
+"""Alternatives (a type's versions and flattened forms): the first that a message has, and has filled in, is used."""
 
 TIME_PATHS: Paths = ("header.stamp", "timestamp", "stamp")
 FRAME_PATHS: Paths = ("header.frame_id", "frame_id")
@@ -15,7 +16,15 @@ FRAME_PATHS: Paths = ("header.frame_id", "frame_id")
 
 @dataclass(frozen=True)
 class Preset:
-    """Message paths of one type: x and y (metres), or latitude and longitude (degrees); a message may lack all others."""
+    """Message paths of one type: x and y (metres), or latitude and longitude (degrees); a message may lack all others.
+
+    covariance       of numbers, row-major, x (east) and y (north) first, m²: 1, 4, 9 or 36 of them, or 6 of an upper triangle
+    covariance_type  0 or a word with UNKNOWN: the covariance says nothing
+    status           negative: no fix
+    flags            even: the position is not valid
+    alternatives     of positions; "first": the first that a message has. "filled": item by item the first that is not zero.
+                     "all": every one of them holds positions of its own
+    """
 
     schemas: tuple[str, ...]
     x: Paths = ()
@@ -24,14 +33,16 @@ class Preset:
     latitude: Paths = ()
     longitude: Paths = ()
     altitude: Paths = ()
-    covariance: Paths = ()  # 4, 9 or 36 numbers, row-major, x (east) and y (north) first, m²
-    covariance_type: Paths = ()  # 0 or a word with UNKNOWN: the covariance says nothing
-    status: Paths = ()  # negative: no fix
+    covariance: Paths = ()
+    covariance_type: Paths = ()
+    status: Paths = ()
+    flags: Paths = ()
     time: Paths = TIME_PATHS
     frame_id: Paths = FRAME_PATHS
     agent: Paths = ()
     sensor: Paths = ()
     score: Paths = ()
+    alternatives: Literal["first", "filled", "all"] = "first"
 
 
 def _metric(schema: str, *points: str) -> Preset:
@@ -52,6 +63,7 @@ def _geodetic(schema: str, fix: str = "") -> Preset:
 
 
 _RESULT = "detections[:].results[0]"
+_KINEMATICS = "objects[:].kinematics"
 
 PRESETS: dict[str, Preset] = {
     "PointStamped": _metric("geometry_msgs.PointStamped", "point"),
@@ -69,11 +81,54 @@ PRESETS: dict[str, Preset] = {
     "PointInFrame": _metric("foxglove.Point3InFrame", "point"),
     "PoseInFrame": _metric("foxglove.PoseInFrame", "pose.position"),
     "PosesInFrame": _metric("foxglove.PosesInFrame", "poses[:].position"),
+    # A detector fills in the box, or only the pose of its best hypothesis. Foxy and ROS 1 have the score beside that pose.
     "Detection3DArray": replace(
-        _metric("vision_msgs.Detection3DArray", "detections[:].bbox.center.position"),
+        _metric("vision_msgs.Detection3DArray", "detections[:].bbox.center.position", f"{_RESULT}.pose.pose.position"),
+        alternatives="filled",
         covariance=(f"{_RESULT}.pose.covariance",),
+        time=(*TIME_PATHS, "detections[:].header.stamp"),
+        frame_id=(*FRAME_PATHS, "detections[:].header.frame_id"),
         agent=("detections[:].id", "detections[:].tracking_id"),
         score=(f"{_RESULT}.hypothesis.score", f"{_RESULT}.score"),
+    ),
+    "RadarTracks": replace(
+        _metric("radar_msgs.RadarTracks", "tracks[:].position"),
+        covariance=("tracks[:].position_covariance",),
+        agent=("tracks[:].uuid",),
+    ),
+    # The names of autoware's packages changed; its detected objects have no identity, its predicted ones another field.
+    "TrackedObjects": replace(
+        _metric(
+            "autoware_perception_msgs.TrackedObjects",
+            f"{_KINEMATICS}.pose_with_covariance.pose.position",
+            f"{_KINEMATICS}.initial_pose_with_covariance.pose.position",
+        ),
+        schemas=tuple(
+            f"{package}.{kind}Objects"
+            for package in ("autoware_perception_msgs", "autoware_auto_perception_msgs")
+            for kind in ("Tracked", "Detected", "Predicted")
+        ),
+        covariance=(
+            f"{_KINEMATICS}.pose_with_covariance.covariance",
+            f"{_KINEMATICS}.initial_pose_with_covariance.covariance",
+        ),
+        agent=("objects[:].object_id",),
+        score=("objects[:].existence_probability",),
+    ),
+    "ADSBVehicle": Preset(
+        ("mavros_msgs.ADSBVehicle",),
+        latitude=("latitude",),
+        longitude=("longitude",),
+        altitude=("altitude",),
+        flags=("flags",),
+        agent=("icao_address", "ICAO_address"),
+    ),
+    "SceneUpdate": replace(
+        _metric("foxglove.SceneUpdate", "entities[:].cubes[:].pose.position", "entities[:].spheres[:].pose.position"),
+        alternatives="all",
+        time=("entities[:].timestamp",),
+        frame_id=("entities[:].frame_id",),
+        agent=("entities[:].id",),
     ),
     "Detection": replace(
         _metric("mission.Detection", "position"),
@@ -83,6 +138,9 @@ PRESETS: dict[str, Preset] = {
         score=("score",),
     ),
 }
+
+NAMES_AGENTS = {"Detection3DArray", "RadarTracks", "TrackedObjects", "ADSBVehicle", "SceneUpdate"}
+"""Presets whose messages always have room for the identity of what was seen."""
 
 
 def normalise_schema(name: str) -> str:

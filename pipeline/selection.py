@@ -1,5 +1,6 @@
 """Which sources serve which role for one log: what the user states, and what the channels suggest for the rest."""
 
+import fnmatch
 from collections.abc import Mapping, Sequence
 
 from cadence.errors import ConfigError, InputError
@@ -15,6 +16,17 @@ ROLES = ("detections", "truth", "poses")
 
 Sources = Mapping[str, tuple[SourceConfig, ...]]
 """Sources by role: "detections", "truth", "poses"."""
+
+
+def selected_channels(channels: Sequence[Channel], patterns: Sequence[str]) -> tuple[Channel, ...]:
+    """The channels whose topic fits one of `patterns` (`*` stands for any characters); all of them without patterns.
+
+    Raises `ConfigError` where a pattern fits none.
+    """
+    for pattern in patterns:
+        if not any(fnmatch.fnmatchcase(channel.topic, pattern) for channel in channels):
+            raise ConfigError(f"extract.topics: no topic of the log fits {pattern!r}; topics: {describe_channels(channels)}")
+    return tuple(c for c in channels if not patterns or any(fnmatch.fnmatchcase(c.topic, pattern) for pattern in patterns))
 
 
 def select_readers(

@@ -3,7 +3,7 @@
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from typing import Protocol
+from typing import Literal, Protocol
 
 from cadence.errors import ConfigError
 from pipeline.message_path import parse_path
@@ -44,11 +44,12 @@ class SourceConfig:
     sensor, sensor_path  who saw it
     x, y, z     message paths of a position in metres
     latitude, longitude, altitude   message paths of a position in degrees (and metres), instead of x, y and z
-    covariance  message path of 1, 4, 9 or 36 numbers (a variance, or rows of a matrix), x (east) and y (north) first, m²
+    covariance  message path of 1, 4, 9 or 36 numbers (a variance, or rows of a matrix) or 6 (an upper triangle), x first, m²
     sigma_m     standard deviation of x and y where the message states no covariance
     score       message path of a confidence
     time        message path of a stamp, or "log_time" or "publish_time"; default: the header's stamp, else the log time
     frame_id    message path of the frame's name; default: the header's
+    frame_convention   axes of x, y and z, after transforms: "enu" (east, north, up) or "ned" (north, east, down)
     """
 
     topic: str
@@ -68,6 +69,7 @@ class SourceConfig:
     score: str | None = None
     time: str | None = None
     frame_id: str | None = None
+    frame_convention: Literal["enu", "ned"] = "enu"
 
     def __post_init__(self) -> None:
         if self.preset is not None and self.preset not in PRESETS:
@@ -75,7 +77,7 @@ class SourceConfig:
         for name in _CHECKED:
             text = getattr(self, name)
             if text is not None and text not in (LOG_TIME, PUBLISH_TIME):
-                _check_path(name, text)
+                _check_path(name, self.without_topic(text))
         if self.sigma_m is not None and not 0 < self.sigma_m < float("inf"):
             raise ValueError(f"topic {self.topic!r}: sigma_m must be positive")
         self._check_position()
@@ -96,6 +98,10 @@ class SourceConfig:
             given += [f"{{{name}}} in the topic"] if name in found else []
             if len(given) > 1:
                 raise ValueError(f"topic {self.topic!r}: give only one of {', '.join(given)}")
+
+    def without_topic(self, path: str) -> str:
+        """A message path as it is written in Foxglove, less the topic; one without topic as it is."""
+        return path[len(self.topic) :] if path.startswith((f"{self.topic}.", f"{self.topic}{{")) else path
 
     def match(self, topic: str) -> Mapping[str, str] | None:
         """The placeholders' values where `topic` is meant (empty without placeholders); None where it is not."""
@@ -121,7 +127,7 @@ def resolve_paths(source: SourceConfig, schema_name: str) -> Preset:
     for name_of_path in paths:
         stated = getattr(source, PATH_KEYS.get(name_of_path, name_of_path), None)
         if stated is not None:
-            paths[name_of_path] = (stated,)
+            paths[name_of_path] = (source.without_topic(stated),)
     return Preset(**paths)
 
 

@@ -26,6 +26,18 @@ def stamp_ns(value: Any) -> int | None:
     return None if found is None or found == 0 or abs(found) >= _LIMIT_NS else found
 
 
+def moment_ns(value: float | str, start_ns: int) -> int | None:
+    """The moment that a user states: seconds after `start_ns` (also as text), or ISO 8601; None where it is neither."""
+    if isinstance(value, str):
+        if _ISO.fullmatch(value.strip()):
+            return stamp_ns(value)
+        try:
+            value = float(value)
+        except ValueError:
+            return None
+    return start_ns + round(value * 1e9) if math.isfinite(value) else None
+
+
 def _pair_ns(value: Any) -> int | None:
     seconds, nanoseconds = _first(value, _SECONDS), _first(value, _NANOSECONDS)
     if seconds is None:

@@ -1,9 +1,10 @@
 """Message bytes to fields, by the schema that the log itself carries.
 
-Decoded messages are plain trees: dataclasses (CDR, ROS 1), protobuf messages or dicts (JSON), lists or numpy arrays for
-repeated fields. `field` reads both kinds.
+Decoded messages are plain trees: dataclasses (CDR, ROS 1), protobuf messages or dicts (JSON, flatbuffer), lists or numpy
+arrays for repeated fields. `field` reads both kinds.
 """
 
+import itertools
 import json
 import re
 from collections.abc import Callable, Iterator
@@ -18,6 +19,7 @@ from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_
 from rosbags.typesys.store import Typestore
 
 from cadence.errors import InputError
+from pipeline.logs.flatbuffer import flatbuffer_decoder
 from pipeline.logs.reader import Channel
 
 Decoder = Callable[[bytes], Any]
@@ -56,6 +58,8 @@ def decoder_for(channel: Channel) -> Decoder:
             decode = _cdr_decoder(channel)
         elif encoding == "ros1":
             decode = _ros1_decoder(channel)
+        elif encoding == "flatbuffer":
+            decode = flatbuffer_decoder(channel.schema_data, channel.schema_name)
         else:
             raise ValueError(f"message encoding {encoding!r} is not known")
 
@@ -182,5 +186,6 @@ def _type_name(store: Typestore, schema_name: str) -> str:
 
 
 def _without_separators(text: str) -> str:
-    """IDL of several files in one schema without the lines (=== and IDL: name) between them."""
-    return "\n".join(line for line in text.splitlines() if not line.startswith("IDL: ") and set(line) != {"="})
+    """IDL of several files in one schema without the lines between them (=== and IDL: name) and without `#include`."""
+    is_definition = (not line.startswith(("IDL: ", "#")) and set(line) != {"="} for line in text.splitlines())
+    return "\n".join(itertools.compress(text.splitlines(), is_definition))

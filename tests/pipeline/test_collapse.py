@@ -14,11 +14,11 @@ def positions(*rows: tuple[int, float, float, tuple[float, float, float], str | 
     built = Rows()
     for place, (ms, x, y, covariance, agent, sensor) in enumerate(rows):
         built.integers.extend((ms * 10**6, ms * 10**6, place))
-        built.floats.extend((x, y, 1.0, *covariance, NAN))
+        built.floats.extend((x, y, 1.0, NAN, *covariance, NAN, NAN, NAN))
         built.agents.append(agent)
         built.sensors.append(sensor)
         built.frame_ids.append("map")
-    return built.finish("/contacts", is_geodetic=False, is_stated=True)
+    return built.finish("/contacts", is_stated=True)
 
 
 EXACT = (NAN, NAN, NAN)

@@ -1,10 +1,25 @@
+import dataclasses
 import itertools
 import json
 import math
+import random
 import struct
+from pathlib import Path
 
+import flatbuffers
+import foxglove_schemas_flatbuffer
 import numpy as np
 import pytest
+from foxglove_schemas_flatbuffer import (
+    CubePrimitive,
+    LocationFix,
+    Point3,
+    Pose,
+    PosesInFrame,
+    SceneEntity,
+    SceneUpdate,
+    Time,
+)
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from mcap.records import Schema
 from mcap_ros2.decoder import DecoderFactory
@@ -234,3 +249,137 @@ def test_decoding_agrees_with_a_message_built_field_by_field():
     assert message.values.tolist() == [1.0, 2.5] and message.names == ["p", "quer"]
     assert message.fixed.tolist() == [1, 2, 3, 4] and message.flag is True
     assert json.dumps(message.names)
+
+
+def flat_channel(name: str) -> Channel:
+    schema = Path(foxglove_schemas_flatbuffer.__file__).parent / f"{name}.bfbs"
+    return channel("flatbuffer", f"foxglove.{name}", "flatbuffer", schema.read_bytes())
+
+
+def flat_poses(num_poses: int = 2) -> bytes:
+    builder = flatbuffers.Builder()
+    frame = builder.CreateString("map")
+    poses = []
+    for i in range(num_poses):
+        Point3.Start(builder)
+        Point3.AddX(builder, 1.5 + i)
+        Point3.AddY(builder, -2.5)
+        position = Point3.End(builder)
+        Pose.Start(builder)
+        Pose.AddPosition(builder, position)
+        poses.append(Pose.End(builder))
+    PosesInFrame.StartPosesVector(builder, num_poses)
+    for pose in reversed(poses):
+        builder.PrependUOffsetTRelative(pose)
+    vector = builder.EndVector()
+    PosesInFrame.Start(builder)
+    PosesInFrame.AddTimestamp(builder, Time.CreateTime(builder, 100, 7))
+    PosesInFrame.AddFrameId(builder, frame)
+    PosesInFrame.AddPoses(builder, vector)
+    builder.Finish(PosesInFrame.End(builder))
+    return bytes(builder.Output())
+
+
+def flat_fix() -> bytes:
+    builder = flatbuffers.Builder()
+    frame = builder.CreateString("gps")
+    LocationFix.StartPositionCovarianceVector(builder, 9)
+    for value in reversed([4.0, 1, 0, 1, 9, 0, 0, 0, 16]):
+        builder.PrependFloat64(value)
+    covariance = builder.EndVector()
+    LocationFix.Start(builder)
+    LocationFix.AddTimestamp(builder, Time.CreateTime(builder, 100, 7))
+    LocationFix.AddFrameId(builder, frame)
+    LocationFix.AddLatitude(builder, 50.5)
+    LocationFix.AddLongitude(builder, -1.25)
+    LocationFix.AddPositionCovariance(builder, covariance)
+    LocationFix.AddPositionCovarianceType(builder, 3)
+    builder.Finish(LocationFix.End(builder))
+    return bytes(builder.Output())
+
+
+def test_flatbuffer_messages_decode_by_the_schema_in_the_log():
+    poses = decoder_for(flat_channel("PosesInFrame"))(flat_poses())
+    assert (poses["timestamp"], poses["frame_id"]) == ({"sec": 100, "nsec": 7}, "map")
+    assert [pose["position"] for pose in poses["poses"]] == [{"x": 1.5, "y": -2.5, "z": 0.0}, {"x": 2.5, "y": -2.5, "z": 0.0}]
+    assert poses["poses"][0]["orientation"] is None
+    fix = decoder_for(flat_channel("LocationFix"))(flat_fix())
+    assert (fix["latitude"], fix["longitude"], fix["altitude"], fix["heading"]) == (50.5, -1.25, 0.0, None)
+    assert fix["position_covariance"].tolist() == [4.0, 1, 0, 1, 9, 0, 0, 0, 16]
+    assert fix["position_covariance_type"] == 3 and fix["position_covariance_type"].name == "KNOWN"
+    empty = decoder_for(flat_channel("PosesInFrame"))(flat_poses(0))
+    assert list(empty["poses"]) == []
+
+
+def test_every_foxglove_flatbuffer_schema_is_understood():
+    schemas = sorted(Path(foxglove_schemas_flatbuffer.__file__).parent.glob("*.bfbs"))
+    assert len(schemas) > 40
+    for schema in schemas:
+        decoder_for(flat_channel(schema.stem))
+
+
+@pytest.mark.parametrize(
+    "broken",
+    [
+        channel("flatbuffer", "foxglove.LocationFix", "flatbuffer", b"\x10\0\0\0BFBS"),
+        channel("flatbuffer", "foxglove.LocationFix", "flatbuffer", b"\x10\0\0\0ABCD" + bytes(64)),
+        channel("flatbuffer", "foxglove.Other", "flatbuffer", flat_channel("LocationFix").schema_data),
+    ],
+)
+def test_wrong_flatbuffer_schemas(broken):
+    with pytest.raises(UndecodableChannel, match="/topic"):
+        decoder_for(broken)
+
+
+@pytest.mark.parametrize(("name", "data"), [("PosesInFrame", flat_poses()), ("LocationFix", flat_fix())])
+def test_damaged_flatbuffers_are_undecodable_or_something_else(name, data):
+    """Cut at every byte, and every byte changed: never a crash, and what is cut is noticed."""
+    decode = decoder_for(flat_channel(name))
+    noise = random.Random(2)
+    num_noticed = 0
+    for i in range(len(data)):
+        if i < len(data) - 1:  # the last byte only ends a text
+            with pytest.raises(UndecodableMessage):
+                decode(data[:i])
+        changed = data[:i] + bytes([data[i] ^ noise.randrange(1, 256)]) + data[i + 1 :]
+        try:
+            decode(changed)
+        except UndecodableMessage:
+            num_noticed += 1
+    assert num_noticed > len(data) / 10
+
+
+def test_damaged_flatbuffer_schemas_neither_crash_nor_hang():
+    whole = flat_channel("LocationFix")
+    noise = random.Random(3)
+    for _ in range(400):
+        schema = bytearray(whole.schema_data)
+        for _ in range(noise.randrange(1, 4)):
+            schema[noise.randrange(len(schema))] = noise.randrange(256)
+        try:
+            decoder_for(dataclasses.replace(whole, schema_data=bytes(schema)))(flat_fix())
+        except InputError as error:
+            assert "\n" not in str(error)
+
+
+def test_flatbuffer_whose_tables_all_share_one_vector_is_refused():
+    """A hundred thousand entities that share one list of a thousand cubes: a megabyte that would ask for 10^8 tables."""
+    builder = flatbuffers.Builder()
+    CubePrimitive.Start(builder)
+    cube = CubePrimitive.End(builder)
+    SceneEntity.StartCubesVector(builder, 1000)
+    for _ in range(1000):
+        builder.PrependUOffsetTRelative(cube)
+    cubes = builder.EndVector()
+    SceneEntity.Start(builder)
+    SceneEntity.AddCubes(builder, cubes)
+    entity = SceneEntity.End(builder)
+    SceneUpdate.StartEntitiesVector(builder, 100_000)
+    for _ in range(100_000):
+        builder.PrependUOffsetTRelative(entity)
+    entities = builder.EndVector()
+    SceneUpdate.Start(builder)
+    SceneUpdate.AddEntities(builder, entities)
+    builder.Finish(SceneUpdate.End(builder))
+    with pytest.raises(UndecodableMessage, match="without end"):
+        decoder_for(flat_channel("SceneUpdate"))(bytes(builder.Output()))

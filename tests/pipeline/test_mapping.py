@@ -26,6 +26,7 @@ def suggest(*channels: tuple[str, str]) -> SuggestedMapping:
 
 FIX = "foxglove.LocationFix"
 POSE = "geometry_msgs/msg/PoseStamped"
+SCENE = "foxglove.SceneUpdate"
 
 
 def test_roles() -> None:
@@ -36,6 +37,12 @@ def test_roles() -> None:
         "/truth/target/pose": (POSE, "truth"),
         "/contacts/A": (FIX, "detections"),
         "/radar/tracks": ("vision_msgs/msg/Detection3DArray", "detections"),
+        "/front": ("radar_msgs/msg/RadarTracks", "detections"),
+        "/perception/objects": ("autoware_auto_perception_msgs/msg/TrackedObjects", "detections"),
+        "/traffic": ("mavros_msgs/msg/ADSBVehicle", "detections"),
+        "/lidar/detections": (SCENE, "detections"),
+        "/scene/obstacles": (SCENE, "obstacles"),
+        "/truth/scene": (SCENE, "truth"),
         "/anything": ("mission.Detection", "detections"),
         "/detections": ("my.Own", "detections"),
         "/trackers": ("foxglove.PosesInFrame", "poses"),
@@ -46,6 +53,7 @@ def test_roles() -> None:
         "/obstacles": ("my.Shapes", "obstacles"),
     }
     neither = {"/rosout/report": "rcl_interfaces/msg/Log", "/radar/image": "sensor_msgs/msg/Image", "/imu": "sensor_msgs/Imu"}
+    neither |= {"/scene": SCENE, "/cadence/detection_fix/A": FIX}
     found = suggest(*((topic, schema) for topic, (schema, _) in expected.items()), *neither.items())
     assert found.roles == {topic: role for topic, (_, role) in expected.items()}
 
@@ -144,7 +152,8 @@ def test_patterns(pattern: str, topic: str, expected: dict[str, str] | None) -> 
         ({"topic": "/a", "agent": "T0", "agent_path": "id"}, "only one of agent, agent_path"),
         ({"topic": "/a", "x": "p.x"}, "go together"),
         ({"topic": "/a", "x": "p.x", "y": "p.y", "latitude": "lat", "longitude": "lon"}, "not both"),
-        ({"topic": "/a", "x": "/a.p.x", "y": "p.y"}, "leave the topic out"),
+        ({"topic": "/a", "x": "/b.p.x", "y": "p.y"}, "leave the topic out"),
+        ({"topic": "/a", "frame_convention": "NED"}, "'NED' is not one of enu, ned"),
         ({"topic": "/a", "x": "p.x", "y": "p[.y"}, r"y: message path 'p\[.y'"),
         ({"topic": "/a", "preset": "Pose"}, "preset 'Pose' is not known"),
         ({"topic": "/a", "sigma_m": 0.0}, "sigma_m"),
@@ -165,6 +174,13 @@ def test_a_stated_position_takes_nothing_of_the_presets_geometry() -> None:
     paths = resolve_paths(SourceConfig("/a", preset="LocationFix", x="p.x", y="p.y"), "foxglove.LocationFix")
     assert (paths.x, paths.latitude, paths.covariance, paths.altitude) == (("p.x",), (), (), ())
     assert "timestamp" in paths.time
+
+
+def test_paths_may_hold_their_topic_as_in_foxglove() -> None:
+    source = SourceConfig("/det", x='/det.detections[:]{id=="T0"}.bbox.center.position.x', y="p.y", score="/det{ok==true}.score")
+    paths = resolve_paths(source, "my.Own")
+    assert (paths.x, paths.y) == (('.detections[:]{id=="T0"}.bbox.center.position.x',), ("p.y",))
+    assert paths.score == ("{ok==true}.score",)
 
 
 def test_no_preset_and_no_paths() -> None:

@@ -1,0 +1,64 @@
+"""Covariances of positions: what messages state, and how they turn with their frame.
+
+A covariance is six numbers: xx, xy, yy (what the tables keep) and xz, yz, zz (what a tilted sensor frame turns into those).
+"""
+
+import math
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+Float64s = npt.NDArray[np.float64]
+Covariance = tuple[float, float, float, float, float, float]
+
+NONE_COVARIANCE: Final[Covariance] = (math.nan,) * 6
+
+_PLACES: Final = {  # xx, xy, yy and xz, yz, zz among as many numbers; without heights: only the first three
+    4: (0, 1, 3),
+    6: (0, 1, 3, 2, 4, 5),
+    9: (0, 1, 4, 2, 5, 8),
+    36: (0, 1, 7, 2, 8, 14),
+}
+
+
+def isotropic(variance_m2: float) -> Covariance:
+    """The same variance in all directions."""
+    return (variance_m2, 0.0, variance_m2, 0.0, 0.0, variance_m2)
+
+
+def stated_covariance(matrix: Any) -> Covariance | None:
+    """The covariance that a message states; None where it says "unknown": another number of them, all zero, or negative.
+
+    1 (a variance), 4, 9 or 36 numbers are rows of a matrix, 6 its upper triangle. `ValueError` where it is none.
+    """
+    if isinstance(matrix, int | float):
+        matrix = (matrix, 0.0, 0.0, matrix)
+    places = _PLACES.get(len(matrix))
+    if places is None:
+        return None
+    xx, xy, yy, *rest = (float(matrix[place]) for place in places)
+    if xx == yy == 0 or xx < 0 or yy < 0:
+        return None
+    if not (math.isfinite(xx) and math.isfinite(xy) and math.isfinite(yy) and xx * yy > xy * xy):
+        raise ValueError("not positive definite")
+    return (xx, xy, yy, *_heights(xx, xy, yy, rest))
+
+
+def _heights(xx: float, xy: float, yy: float, stated: list[float]) -> tuple[float, float, float]:
+    """xz, yz, zz; where they are unknown or no part of a covariance, the mean of the other variances alone.
+
+    Without a height's variance a sensor that looks sideways would be taken as exact in one direction.
+    """
+    xz, yz, zz = stated or (0.0, 0.0, 0.0)
+    if not (math.isfinite(xz) and math.isfinite(yz) and math.isfinite(zz) and zz > 0):
+        return 0.0, 0.0, (xx + yy) / 2
+    determinant = xx * (yy * zz - yz * yz) - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz)
+    return (xz, yz, zz) if determinant > 0 else (0.0, 0.0, zz)
+
+
+def rotated(covariance_m2: Float64s, rotation: Float64s) -> Float64s:
+    """R C R' [N, 6] of covariances [N, 6] in a frame that is turned by R [N, 3, 3]."""
+    full = covariance_m2[:, [0, 1, 3, 1, 2, 4, 3, 4, 5]].reshape(-1, 3, 3)
+    turned = np.einsum("nij,njk,nlk->nil", rotation, full, rotation).reshape(-1, 9)
+    return np.ascontiguousarray(turned[:, [0, 1, 4, 2, 5, 8]])
