@@ -77,8 +77,8 @@ def _render(rows: list[tuple[int, float, float]], rounds: int) -> str:
     lines = [
         "# What attention between agents costs",
         "",
-        f"Made by `python benchmarks/attention_cost.py --publish docs/benchmarks`: {NUM_HYPOTHESES} joint hypotheses for one window",
-        f"of A agents, six steps of DPM-Solver++, one thread, median of {rounds} rounds. Times over that of one agent alone.",
+        f"Made by `python benchmarks/attention_cost.py --publish docs/benchmarks`: {NUM_HYPOTHESES} joint hypotheses for one",
+        f"window of A agents, six steps of DPM-Solver++, one thread, median of {rounds} rounds. Times over that of one agent.",
         "",
         "| agents | every agent for itself | all together | together over alone |",
         "|---|---|---|---|",

@@ -27,7 +27,7 @@ from torch import Tensor
 from cadence import metrics
 from cadence.association.associate import associate
 from cadence.association.types import AssociationConfig
-from cadence.diffusion.scene import SceneModel
+from cadence.diffusion.scene import SceneModel, SceneSampling
 from cadence.types import Detections, HypothesisSet, WindowBatch
 from cadence.worlds.joint import MEETING_RADIUS_M, JointRecordings, meets
 from cadence.worlds.recordings import ForecastWindows, choose_windows, cut_windows
@@ -41,8 +41,12 @@ from pipeline.scene import load_scene
 HORIZONS = (0, 29, 59, 89, 119)
 LABELS = ("0", "30", "60", "90", "120")
 NUM_HYPOTHESES = 30
+SOON_M = 3000.0
+"""Agents nearer to a site than this are not shown in the picture: that they meet is no question any more."""
 NUM_WAYS = 15
 """Ways of telling detections apart for a window; each has two hypotheses."""
+STEPS = (40, 160)
+"""Windows begin so many minutes after their episode: most groups that meet are on their way then, and meet within two hours."""
 KNOWN, KNOWN_ALONE = "known origin, attention", "known origin, no attention (single-target model)"
 SHARED, SHARED_ALONE = "unknown origin, shared embedding, attention", "unknown origin, shared embedding, no attention"
 TOLD_APART = "unknown origin, told apart, then known origin with attention"
@@ -85,8 +89,10 @@ def parser() -> argparse.ArgumentParser:
 
 
 def held_out(episodes: JointRecordings, num: int, seed: int) -> ForecastWindows:
-    """Windows at random steps at which every agent was detected before; nobody is told where agents started."""
-    episode, step = choose_windows(episodes.recordings, 2 * num, np.random.default_rng(seed), known_start=False)
+    """Windows at random steps of `STEPS`, at which every agent was detected before; nobody is told where agents started."""
+    episode, step = choose_windows(episodes.recordings, 6 * num, np.random.default_rng(seed), known_start=False)
+    is_between = (step >= STEPS[0]) & (step < STEPS[1])
+    episode, step = episode[is_between], step[is_between]
     windows = cut_windows(episodes.recordings, episode, step, known_start=False, seed=seed)
     is_useful = windows.windows.is_active.all(dim=1).nonzero()[:, 0]
     chosen = torch.randperm(len(is_useful), generator=torch.Generator().manual_seed(seed))[:num]
@@ -95,10 +101,11 @@ def held_out(episodes: JointRecordings, num: int, seed: int) -> ForecastWindows:
 
 def estimators(folder: Path, known_name: str, episodes: JointRecordings) -> dict[str, Estimator]:
     """Every row of the table."""
-    known = load_scene(find_checkpoint(known_name))
+    sampling = SceneSampling(precision="bfloat16")
+    known = load_scene(find_checkpoint(known_name), sampling)
 
     def ablation(name: str) -> Estimator:
-        return drawn_by(load_scene(folder / f"rendezvous_{name}.safetensors"))
+        return drawn_by(load_scene(folder / f"rendezvous_{name}.safetensors", sampling))
 
     return {
         KNOWN: drawn_by(known),
@@ -302,9 +309,10 @@ def render(scores: dict[str, Scores], windows: ForecastWindows, options: argpars
         f"{options.seed} --publish docs` with {versions()['cadence']}; one training seed. {len(windows)} windows of "
         f"{len(np.unique(groups))} held-out episodes of the world rendezvous, three agents, 30 joint hypotheses, 120 steps of "
         "a minute. Errors in kilometres, mean over agents, ± standard error by a bootstrap over episodes. Sampler: "
-        "DPM-Solver++ with six steps, fixed before. The networks have one size and were trained alike (4 500 steps of 64 "
-        "windows, `cadence/checkpoints/rendezvous.toml`, `benchmarks/configs/rendezvous_*.toml`). Where the origin is unknown, the "
-        "agents of each hypothesis are put in the order that suits the truth best, which favours these rows.",
+        f"DPM-Solver++ with six steps (bfloat16), fixed before. Windows begin {STEPS[0]} to {STEPS[1]} minutes after their "
+        "episode. The networks have one size and were trained alike (4 500 steps of 64 windows, "
+        "`cadence/checkpoints/rendezvous.toml`, `benchmarks/configs/rendezvous_*.toml`). Where the origin is unknown, "
+        "the agents of each hypothesis are put in the order that suits the truth best, which favours these rows.",
         table("ADE: mean error of single hypotheses up to the horizon", lambda s: s.ade),
         table("minADE: error at the step of the best joint hypothesis", lambda s: s.least),
         table("Error at the step", lambda s: s.at_step),
@@ -339,10 +347,11 @@ def reliability(
 
 
 def draw_two(drawn: HypothesisSet, windows: ForecastWindows) -> plt.Figure:
-    """The window whose hypotheses are most divided about meeting, and one hypothesis of either kind."""
+    """Of windows in which nobody is at a site yet, the one most divided about meeting, and one hypothesis of either kind."""
     absolute = (drawn.position_m.double() + windows.context.datum_m[:, None, None, None]).numpy()
     has_met = meets(absolute, SITES_M)
-    window = int(np.abs(has_met.mean(axis=1) - 0.5).argmin())
+    is_near = np.linalg.norm(absolute[:, :, :, 0, None] - SITES_M, axis=-1).min(axis=-1).mean(axis=1) < SOON_M  # [B, A]
+    window = int((np.abs(has_met.mean(axis=1) - 0.5) + is_near.any(axis=1)).argmin())
     figure, axes = plt.subplots(1, 2, figsize=(13, 6.5), layout="constrained", sharex=True, sharey=True)
     for axis, kind, title in zip(axes, (True, False), ("one that meets", "one that goes straight on"), strict=True):
         chosen = int(np.flatnonzero(has_met[window] == kind)[0])
