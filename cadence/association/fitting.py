@@ -17,10 +17,11 @@ from cadence.association.types import CLUTTER, AssociationConfig
 
 Floats = NDArray[np.float64]
 
-_RELAXATIONS = (0.3, 1.5, 8.0)
+_RELAXATIONS = (0.3, 2.0, 12.0, 72.0)
 _SPEEDS = tuple(3.0 ** -np.arange(8.0))
 """Ways to move in units of the mean time between two detections of an agent, and of the stream's extent in that time."""
 _SWITCH_SHARE = 0.2
+_TEMPER = 0.6
 _NUM_AGENTS = (3, 10, 30)
 _NUM_PARTICLES = 16
 _MAX_DETECTIONS = 400
@@ -65,6 +66,7 @@ def _first_habits(stream: Stream, config: AssociationConfig, num_agents: int, ma
         arrive_hz=0.0 if is_known else num_agents / span_s,
         clutter_hz=max(config.clutter_share, _LEAST_CLUTTER) * num / span_s,
         area_m2=float(np.prod(np.maximum(sizes, 0.1 * extent_m))),
+        temper=_TEMPER,
         floor_m=1e-5 * extent_m,
         num_agents=config.num_agents,
         max_agents=config.max_agents,

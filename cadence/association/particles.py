@@ -102,8 +102,8 @@ def _next(
 def continuations(tracks: Tracks, habits: Habits, seen: Detection, before_s: float) -> Floats:
     """Log density [P, A + 2] of the silence up to the detection and of the detection from each agent, a new one, or nobody."""
     out = log_hazards(tracks, habits, seen.time_s) + log_silence_between(tracks, habits, before_s, seen.time_s)[:, None]
-    out[:, :-2] += log_densities(tracks, habits.modes, seen)
-    out[:, -2:] -= np.log(habits.area_m2)
+    out[:, :-2] += habits.temper * log_densities(tracks, habits.modes, seen)
+    out[:, -2:] -= habits.temper * np.log(habits.area_m2)
     if habits.max_speed_mps is not None:
         out[:, :-2][is_too_fast(tracks, habits, seen)] = -np.inf
     return out

@@ -28,6 +28,7 @@ class Habits:
     arrive_hz      new agents detected per second, where the number of agents is unknown
     clutter_hz     false detections per second
     area_m2        where new agents and clutter are met, evenly
+    temper         exponent of a position's density: below one, as every model of motion is wrong a little
     floor_m        no detection counts as more exact than this
     num_agents     how many there are; None: unknown
     max_agents     never more than this
@@ -40,6 +41,7 @@ class Habits:
     arrive_hz: float
     clutter_hz: float
     area_m2: float
+    temper: float
     floor_m: float
     num_agents: int | None
     max_agents: int
