@@ -195,7 +195,7 @@ def _pull(url: str, home: Path) -> None:
     for name in [name for name in there if name.endswith(_MANIFEST_ENDING) and name != RECEIPT_NAME]:
         (home / name).write_bytes(read_bytes(f"{url}/{name}"))
     for name in sorted(_outputs(home) & set(there)):
-        shutil.move(fetch(there[name], home / SOURCE_NAME, Progress(quiet=True)), home / name)
+        shutil.move(fetch(describe(there[name].url), home / SOURCE_NAME, Progress(quiet=True)), home / name)
 
 
 def _read_receipt(directory: str) -> dict[str, Any] | None:

@@ -141,10 +141,10 @@ def remove(url: str) -> None:
 
 
 def fetch(found: StoredObject, folder: Path, progress: Progress) -> Path:
-    """The object as a file in `folder`. What an interrupted call fetched of the same content is not fetched again.
+    """The object, as `describe` found it, as a file in `folder`.
 
-    Raises `InputError` where the object is gone or changes meanwhile, `DeviceError` where the store does not answer or the
-    disk is full.
+    What an interrupted call fetched of the same content is not fetched again. Raises `InputError` where the object is gone or
+    changes meanwhile, `DeviceError` where the store does not answer or the disk is full.
     """
     identity = hashlib.sha256(f"{shown(found.url)} {found.size_bytes} {found.etag}".encode()).hexdigest()[:16]
     target, part, mark = (folder / name for name in (found.name, f".{found.name}.{identity}.part", f".{found.name}.{identity}"))
@@ -221,14 +221,16 @@ def _is_ranged(fs: Any, path: str, found: StoredObject) -> bool:
     return found.size_bytes > 0 and _attempt(ask, found.url)
 
 
-def _attempt(action: Callable[[], T], url: str, is_output: bool = False, num_attempts: int = NUM_ATTEMPTS) -> T:
+def _attempt(action: Callable[[], T], url: str, is_output: bool = False, num_attempts: int | None = None) -> T:
     """What `action` returns; it is tried again after failures that may pass. Other failures of a store are explained."""
+    num_attempts = num_attempts or NUM_ATTEMPTS
     for number in range(1, num_attempts + 1):
         try:
             return action()
         except Exception as error:
             if not _is_of_storage(error):
                 raise
+            error = _unwrapped(error)
             explained = _explained(error, url, is_output)
             if explained is not None:
                 raise explained from error
@@ -243,6 +245,13 @@ def _attempt(action: Callable[[], T], url: str, is_output: bool = False, num_att
 
 def _is_of_storage(error: Exception) -> bool:
     return isinstance(error, OSError) or any(kind.__module__.split(".")[0] in _LIBRARIES for kind in type(error).__mro__)
+
+
+def _unwrapped(error: Exception) -> Exception:
+    """What happened: fsspec calls every failure of a web server a file that is not found."""
+    cause = error.__cause__
+    is_web = isinstance(cause, OSError) or type(cause).__module__.split(".")[0] == "aiohttp"
+    return cause if isinstance(error, FileNotFoundError) and isinstance(cause, Exception) and is_web else error
 
 
 def _explained(error: Exception, url: str, is_output: bool) -> CadenceError | None:
