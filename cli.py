@@ -32,7 +32,7 @@ app = typer.Typer(
       cadence COMMAND --help                options and examples of one command
 
     Exit codes: 0 ok, 1 defect, 2 wrong call, 3 unusable input, 4 configuration, 5 device or storage, 6 quality gate,
-    130 interrupted.
+    7 damaged input (doctor), 130 interrupted.
     """,
 )
 
@@ -94,6 +94,25 @@ def info(log: Log, as_json: Json = False) -> None:
 
     description = describe_log(log)
     typer.echo(to_json(description) if as_json else render(description))
+
+
+@app.command()
+def doctor(logs: Logs, quiet: Quiet = False, as_json: Json = False) -> int:
+    """Say what is wrong with a log, what can be used of it, and what to do.
+
+    Damage and lost time spans, index and checksums, clocks and gaps, channels that cannot be decoded, what `cadence run`
+    would take. Exit code 0: every message can be read; 7: messages are lost, or may be; 3: no message can be read.
+
+    \b
+    Examples:
+      cadence doctor flight.mcap
+      cadence doctor logs --json
+    """
+    from pipeline.doctor import diagnose_all, exit_code, render
+
+    found = diagnose_all(logs, Progress(quiet))
+    typer.echo(to_json(found) if as_json else "\n\n".join(map(render, found)))
+    return exit_code(found)
 
 
 @app.command()

@@ -39,3 +39,9 @@ class QualityGateError(CadenceError):
     """A result was produced but does not meet the gate that was asked for."""
 
     exit_code = 6
+
+
+class PartialInputError(CadenceError):
+    """A log is damaged: what is sound was read, some of it is lost."""
+
+    exit_code = 7

@@ -23,7 +23,7 @@ import cli
 from pipeline.config import TABLES
 from pipeline.presets import PRESETS
 
-COMMANDS = ("info", "run", "ingest", "extract", "infer", "export", "report", "evaluate", "simulate", "train")
+COMMANDS = ("info", "doctor", "run", "ingest", "extract", "infer", "export", "report", "evaluate", "simulate", "train")
 
 CLI_INTRODUCTION = """# Command line
 
@@ -31,7 +31,8 @@ Made from the commands' own help by `make docs`.
 
 Results go to stdout (as text, or with `--json` as JSON), progress and errors to stderr. Exit codes: 0 ok, 1 defect (with a
 traceback), 2 wrong call, 3 unusable input, 4 configuration, mapping or checkpoint that does not fit, 5 device or storage,
-6 quality gate not met, 130 interrupted. `cadence run` on several logs goes on after a bad one and leaves with the highest code.
+6 quality gate not met, 7 damaged input (`cadence doctor`), 130 interrupted. `cadence run` on several logs goes on after a bad
+one and leaves with the highest code.
 """
 
 CONFIGURATION_INTRODUCTION = """# Configuration
