@@ -18,8 +18,8 @@ Bools = npt.NDArray[np.bool_]
 _EARTH = {"earth", "ecef", "utm", "wgs84"}
 """Frames of the whole earth: the mission's frame lies below them."""
 
-_ALMOST_PARALLEL = 0.9995
-"""Cosine from which on slerp's formula divides by nearly nothing, and a straight line is as good."""
+_NO_ANGLE = 1e-6
+"""Radians below which slerp's formula divides by nearly nothing, and a straight line is as good."""
 
 
 @dataclass(frozen=True)
@@ -154,11 +154,11 @@ def tree_of(links: Sequence[Link], problems: Sequence[str] = ()) -> TransformTre
 
 def slerp(first: Float64s, second: Float64s, share: Float64s) -> Float64s:
     """Unit quaternions [N, 4] at `share` [N] of the shortest arc from `first` to `second` [N, 4]."""
-    cosine = np.einsum("ni,ni->n", first, second)
-    second = np.where(cosine[:, None] < 0, -second, second)
-    cosine = np.abs(cosine)
-    angle = np.arccos(np.minimum(cosine, 1.0))
-    is_line = cosine > _ALMOST_PARALLEL
+    is_far = np.einsum("ni,ni->n", first, second) < 0
+    second = np.where(is_far[:, None], -second, second)
+    # Of two chords: the arc cosine of their product would lose half the digits of small angles.
+    angle = 2 * np.arctan2(np.linalg.norm(first - second, axis=1), np.linalg.norm(first + second, axis=1))
+    is_line = angle < _NO_ANGLE
     sine = np.where(is_line, 1.0, np.sin(angle))
     weight_first = np.where(is_line, 1 - share, np.sin((1 - share) * angle) / sine)
     weight_second = np.where(is_line, share, np.sin(share * angle) / sine)

@@ -212,10 +212,27 @@ def test_covariances_that_are_none(tmp_path: Path) -> None:
     assert found.summary["bad_covariance"] == 2  # zeros, -1 and a wrong length say "unknown"
 
 
-def test_time_cut(tmp_path: Path) -> None:
-    found = run(tmp_path, line(), start_s=1.0, end_s=3.0)
+@pytest.mark.parametrize(
+    ("start", "end"),
+    [(1.0, 3.0), (1, "3"), ("2023-11-14T22:13:21Z", 3.0), ("2023-11-14 22:13:21", "2023-11-14T23:13:23.000+01:00")],
+)
+def test_time_cut(tmp_path: Path, start: float | str, end: float | str) -> None:
+    found = run(tmp_path, line(), start=start, end=end)
     assert (found.detections["x_m"].to_pylist(), found.summary["outside_time_cut"]) == ([3.0, 6.0, 9.0], 2)
-    fails(tmp_path / "cut", mkdir(tmp_path / "cut", line()), InputError, "start_s", start_s=100.0)
+
+
+def test_time_cuts_that_leave_nothing_or_make_no_sense(tmp_path: Path) -> None:
+    fails(mk(tmp_path / "a"), line(), InputError, r"inside extract\.start and extract\.end", start=100.0)
+    fails(mk(tmp_path / "b"), line(), ConfigError, r"extract\.start 3.0 lies after extract\.end 1.0", start=3.0, end=1.0)
+    fails(mk(tmp_path / "c"), line(), ConfigError, "extract: start = 'noon': expected seconds after", start="noon")
+
+
+def test_only_selected_topics(tmp_path: Path) -> None:
+    rows = [*line(), *line(topic="/radar/contacts"), pose(0, 0, 0)]
+    found = run(tmp_path, rows, topics=["/rad*", "/truth/*"])
+    assert set(found.detections["topic"].to_pylist()) == {"/radar/contacts"}
+    assert (found.summary["num_truth"], found.summary["unselected_topics"]) == (1, 1)
+    fails(mk(tmp_path / "a"), line(), ConfigError, r"extract\.topics: no topic of the log fits '/rader'", topics=["/rader"])
 
 
 def test_spikes_are_left_out(tmp_path: Path) -> None:
