@@ -8,7 +8,7 @@ from collections import deque
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
-from multiprocessing.context import SpawnContext, SpawnProcess
+from multiprocessing.context import ForkServerContext, ForkServerProcess
 from types import FrameType
 
 from cadence.errors import DeviceError
@@ -31,7 +31,9 @@ def run_in_processes(
     """Run the tasks in `num_workers` processes, each with one thread. A task whose process dies has a failed outcome."""
     waiting = deque(tasks)
     workers: dict[Connection, _Worker] = {}
-    context = multiprocessing.get_context("spawn")  # a fork would copy locks of torch's threads
+    # Forked from a process that has imported everything and runs no threads: workers start at once and share that memory.
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["pipeline.batch"])
     try:
         while waiting or workers:
             while waiting and len(workers) < num_workers:
@@ -57,7 +59,7 @@ def run_in_processes(
 class _Worker:
     """A process, the connection to it, and the task that it is running."""
 
-    process: SpawnProcess
+    process: ForkServerProcess
     connection: Connection
     task: LogTask
 
@@ -93,7 +95,7 @@ class _Worker:
         return f"{self.task.log}: its worker process ended {how}{advice}; run again to try it once more"
 
 
-def _start(context: SpawnContext, run: RunTask, task: LogTask) -> _Worker:
+def _start(context: ForkServerContext, run: RunTask, task: LogTask) -> _Worker:
     ours, theirs = context.Pipe()
     process = context.Process(target=_work, args=(theirs, run), daemon=True)
     before = {name: os.environ.get(name) for name in _ONE_THREAD}

@@ -1,0 +1,51 @@
+"""Tiny batches, run in processes that can be killed: they are forked from one that has imported everything already."""
+
+import multiprocessing
+from multiprocessing.process import BaseProcess
+from pathlib import Path
+
+from logs_fixture import straight_line, write_log
+
+import cli
+from pipeline.manifest import hash_file
+
+SETTINGS = {
+    "infer.checkpoint": "none", "infer.num_hypotheses": 2, "infer.grid.stride_steps": 64, "infer.grid.history_steps": 8,
+    "infer.grid.horizon_steps": 8, "infer.association.num_particles": 8, "infer.association.num_agents": 1,
+}  # fmt: skip
+FLAGS = [word for name, value in SETTINGS.items() for word in ("--set", f"{name}={value}")] + ["--quiet"]
+
+_context = multiprocessing.get_context("forkserver")
+_context.set_forkserver_preload(["pipeline.run", "batch_fixture"])
+
+
+def write_tiny_logs(folder: Path, count: int) -> Path:
+    """Logs of different length, named a.mcap, b.mcap, ..."""
+    folder.mkdir()
+    for i in range(count):
+        write_log(folder / f"{chr(97 + i)}.mcap", straight_line(6 + i))
+    return folder
+
+
+def run_command(*arguments: object) -> None:
+    """`cadence run` with tiny settings; leaves with its exit code."""
+    raise SystemExit(cli.main(["run", *map(str, arguments), *FLAGS]))
+
+
+def start(*arguments: object) -> BaseProcess:
+    """`cadence run` in a process of its own; without `--workers` it has no others."""
+    process = _context.Process(target=run_command, args=arguments if "--workers" in arguments else (*arguments, "--workers", 0))
+    process.start()
+    return process
+
+
+def results_of(out: Path) -> dict[str, str]:
+    """SHA-256 of every file below `out`, hidden ones too, but for batch.json, which holds times."""
+    return {
+        str(path.relative_to(out)): hash_file(path) for path in out.rglob("*") if path.is_file() and path.name != "batch.json"
+    }
+
+
+def hidden_in(out: Path) -> list[str]:
+    """What begins with a dot, at any depth."""
+    return sorted(str(path.relative_to(out)) for path in out.rglob(".*"))
