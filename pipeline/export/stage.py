@@ -33,6 +33,8 @@ from schemas.channels import Channel
 _TABLES = ("hypotheses.parquet", "windows.parquet", "detections.parquet")
 _EARLIER_STAGES = ("ingest", "extract", "infer")
 _UNKNOWN_AGENT_ID = "unknown"
+_VERTICES, _VERTICES_OF_SHORT_SCENES = 32, 15
+_SHORT_SCENE_TICKS = 3
 _CLOCK_TOLERANCE_NS = 10 * 1_000_000_000
 
 
@@ -44,7 +46,8 @@ class ExportConfig:
                           where the scenes would exceed max_scene_mb
     max_scene_mb          megabytes of scenes before compression: what a viewer has to read
     num_scene_hypotheses  hypotheses drawn for each agent, the heaviest first; all are in /cadence/hypotheses
-    max_vertices          points of a drawn hypothesis
+    max_vertices          points of a drawn hypothesis; by default 32, or 15 where hypotheses are new in most scenes (lines that
+                          stay cost next to nothing, new ones about 20 kB a scene for three agents)
     occupancy_cells       cells along the longer side of the heat map
     map_period_s          seconds between two regions on the map (viewers draw all at once); by default a window's length
     combined              also write the source log and our channels into one file
@@ -54,7 +57,7 @@ class ExportConfig:
     tick_s: float | None = None
     max_scene_mb: float = 400.0
     num_scene_hypotheses: int = 30
-    max_vertices: int = 32
+    max_vertices: int | None = None
     occupancy_cells: int = 128
     map_period_s: float | None = None
     combined: bool = False
@@ -67,8 +70,10 @@ class ExportConfig:
                 raise ValueError(f"{name} must be at least 0.001 s, got {value}")
         if not self.max_scene_mb > 0:
             raise ValueError(f"max_scene_mb must be positive, got {self.max_scene_mb}")
-        if self.num_scene_hypotheses < 1 or not 4 <= self.max_vertices <= 1000 or not 4 <= self.occupancy_cells <= 2048:
-            raise ValueError("num_scene_hypotheses must be at least 1, max_vertices 4 to 1000, occupancy_cells 4 to 2048")
+        if self.max_vertices is not None and not 4 <= self.max_vertices <= 1000:
+            raise ValueError(f"max_vertices must be 4 to 1000, got {self.max_vertices}")
+        if self.num_scene_hypotheses < 1 or not 4 <= self.occupancy_cells <= 2048:
+            raise ValueError("num_scene_hypotheses must be at least 1, occupancy_cells 4 to 2048")
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,7 +153,8 @@ def _read_mission(directory: Path, catalogue: Catalogue, config: ExportConfig) -
     scenes = build_scenes(hypotheses)
     offset_ns = _clock_offset_ns(table)
     tick_ns = _tick_ns(scenes, config)
-    style = _style(hypotheses, table, config)
+    ticks = plan_ticks(scenes, tick_ns, catalogue.end_ns - offset_ns) if scenes else []
+    style = _style(hypotheses, table, config, num_vertices(len(scenes), len(ticks), config))
     return _Mission(
         catalogue=catalogue,
         hypotheses=hypotheses,
@@ -157,7 +163,7 @@ def _read_mission(directory: Path, catalogue: Catalogue, config: ExportConfig) -
         obstacles=obstacles,
         style=style,
         scenes=scenes,
-        ticks=plan_ticks(scenes, tick_ns, catalogue.end_ns - offset_ns) if scenes else [],
+        ticks=ticks,
         tick_s=tick_ns * 1e-9,
         clock_offset_ns=offset_ns,
     )
@@ -196,7 +202,7 @@ def _tick_ns(scenes: list[Scene], config: ExportConfig) -> int:
     # On the wire a flat point takes 20 bytes, and a line 70 more, twice: past and future.
     lines = np.mean([sum(min(len(live.weight), config.num_scene_hypotheses) for live in scene.live) for scene in scenes])
     seconds = (scenes[-1].end_ns - scenes[0].origin_ns) * 1e-9
-    needed_s = seconds * lines * (20.0 * config.max_vertices + 140.0) / (config.max_scene_mb * 1e6)
+    needed_s = seconds * lines * (20.0 * (config.max_vertices or _VERTICES) + 140.0) / (config.max_scene_mb * 1e6)
     return max(tick_ns, int(np.ceil(needed_s)) * 1_000_000_000)
 
 
@@ -209,7 +215,13 @@ def _marks(detections: pa.Table) -> tuple[Marks, ...]:
     return tuple(Marks(name, time_ns[(agent == name) & usable], position_m[(agent == name) & usable]) for name in ids)
 
 
-def _style(hypotheses: MissionHypotheses, detections: pa.Table, config: ExportConfig) -> Style:
+def num_vertices(num_scenes: int, num_ticks: int, config: ExportConfig) -> int:
+    """Points of a drawn hypothesis where `num_scenes` different scenes are shown in `num_ticks` ticks."""
+    is_short = num_ticks < _SHORT_SCENE_TICKS * num_scenes
+    return config.max_vertices or (_VERTICES_OF_SHORT_SCENES if is_short else _VERTICES)
+
+
+def _style(hypotheses: MissionHypotheses, detections: pa.Table, config: ExportConfig, vertices: int) -> Style:
     position_m = _positions(detections)
     position_m = position_m[np.isfinite(position_m).all(axis=-1)]
     corners = np.stack([position_m.min(axis=0), position_m.max(axis=0)]) if len(position_m) else np.zeros((2, 2))
@@ -222,7 +234,7 @@ def _style(hypotheses: MissionHypotheses, detections: pa.Table, config: ExportCo
         extent_m=max(extent_m, 1.0),
         z_m=round(float(z_m.mean()), 1) if len(z_m) else 0.0,
         num_hypotheses=config.num_scene_hypotheses,
-        max_vertices=config.max_vertices,
+        max_vertices=vertices,
     )
 
 

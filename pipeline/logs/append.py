@@ -6,6 +6,7 @@ source in time; readers that follow the index, and ours, put the messages of bot
 
 import os
 import zlib
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import BinaryIO, Final
 
@@ -17,7 +18,7 @@ from pipeline.logs.records import DamagedRecord
 from pipeline.logs.source_index import SourceIndex, read_index
 from pipeline.progress import Progress
 
-_BLOCK_BYTES: Final = 2**20
+_BLOCK_BYTES: Final = 2**21
 
 
 def write_combined(source: Path, side: Path, target: Path, packing: Packing, progress: Progress) -> None:
@@ -65,18 +66,22 @@ def _damaged(source: Path, reason: str) -> InputError:
 def _copy(source: Path, source_file: BinaryIO, target: BinaryIO, found: SourceIndex, progress: Progress) -> int | None:
     """Copy the source up to the end of its data; the checksum of that, None where the source has none to compare with."""
     source_file.seek(0)
-    checksum, position, buffer = 0, 0, memoryview(bytearray(_BLOCK_BYTES))
-    with progress.bar(found.data_end, f"combine {source.name}", unit="B", scale=True) as bar:
-        while position < found.data_end:
-            num_bytes = source_file.readinto(buffer[: found.data_end - position])  # type: ignore[attr-defined]
-            if not num_bytes:
+    checksum, remaining = 0, found.data_end
+    with (
+        progress.bar(found.data_end, f"combine {source.name}", unit="B", scale=True) as bar,
+        ThreadPoolExecutor(max_workers=1) as beside,  # the checksum takes longer than the copy
+    ):
+        checked: Future[int] | None = None
+        while remaining:
+            block = source_file.read(min(_BLOCK_BYTES, remaining))
+            if not block:
                 raise _damaged(source, "it became shorter meanwhile")
-            block = buffer[:num_bytes]
+            checksum = checked.result() if checked else 0
+            checked = beside.submit(zlib.crc32, block, checksum) if found.checksum else None
             target.write(block)
-            if found.checksum:
-                checksum = zlib.crc32(block, checksum)
-            position += num_bytes
-            bar.update(num_bytes)
+            remaining -= len(block)
+            bar.update(len(block))
+        checksum = checked.result() if checked else 0
     if found.checksum != checksum:
         raise _damaged(source, "the checksum over all data does not match")
     return checksum if found.checksum else None

@@ -31,8 +31,8 @@ class Packing:
     """
 
     compression: Compression = "zstd"
-    chunk_bytes: int = 4 * 2**20
-    level: int = 3
+    chunk_bytes: int = 2 * 2**20
+    level: int = 1
 
     def compressor(self) -> Callable[[bytes], bytes]:
         """What packs the content of a chunk; the same bytes for the same content."""

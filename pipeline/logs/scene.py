@@ -1,24 +1,24 @@
 """foxglove.SceneUpdate as bytes, straight from arrays.
 
 Hundreds of lines a tick, thousands of points: building them as protobuf objects costs tens of milliseconds a message. All
-lines of a group have the same number of points, so every one of them has the same length on the wire: numpy fills a
-structured array whose items *are* the wire format. Fields are in the order of their numbers, so that the bytes equal those
-of the reference classes wherever these write a number at all (they leave out zeros; both parse to the same message).
+lines of a group have the same number of points, so every one of them has the same length on the wire: one is encoded with
+zeros, repeated, and numpy puts all numbers into their places at once. Fields are in the order of their numbers, so that the
+bytes equal those of the reference classes wherever these write a number at all (they leave out zeros; both parse to the same
+message).
 """
 
+import functools
 import struct
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.logs.wire import BYTES, DOUBLE, field, varint
+from pipeline.logs.wire import DOUBLE, field, varint
 
 Floats = npt.NDArray[np.floating]
-
-_POINT = 5 << 3 | BYTES
 
 
 class LineType(IntEnum):
@@ -108,65 +108,61 @@ def _encode_lines(lines: Lines) -> bytes:
     if not num_lines or not num_points:
         return b""
     # The z of a flat scene is zero, and zero is not written.
-    axes = 3 if np.any(lines.point_m[..., 2]) else 2
-    point = np.dtype([("head", "u1", (2,)), ("axis", [("tag", "u1"), ("value", "<f8")], (axes,))])
-    before = (b"\x08" + bytes([lines.type]) if lines.type else b"") + field(2, _IDENTITY_POSE)
-    before += b"\x19" + struct.pack("<d", lines.thickness_px) + b"\x20\x01"  # scale_invariant
-    length = len(before) + num_points * point.itemsize + 2 + _COLOR.itemsize
-    prefix = b"\x5a" + varint(length) + before
-    line = np.dtype(
-        [("prefix", "u1", (len(prefix),)), ("points", point, (num_points,)), ("head", "u1", (2,)), ("color", _COLOR)]
-    )
-    wire = np.empty(num_lines, dtype=line)
-    wire["prefix"] = np.frombuffer(prefix, np.uint8)
-    wire["points"]["head"] = (_POINT, point.itemsize - 2)
-    wire["points"]["axis"]["tag"] = (0x09, 0x11, 0x19)[:axes]
-    wire["points"]["axis"]["value"] = lines.point_m[..., :axes]
-    wire["head"] = (0x32, _COLOR.itemsize)
-    _fill_color(wire["color"], lines.color)
-    return wire.tobytes()
+    axes = 3 if lines.point_m[..., 2].any() else 2
+    template, first_point, first_channel = _line_template(num_points, axes, lines.type, lines.thickness_px)
+    wire, line = bytearray(template * num_lines), len(template)
+    _numbers(wire, first_point, (num_lines, num_points, axes), (line, 2 + 9 * axes, 9))[...] = lines.point_m[..., :axes]
+    _numbers(wire, first_channel, (num_lines, 4), (line, 9))[...] = lines.color
+    return bytes(wire)
+
+
+@functools.lru_cache(maxsize=64)
+def _line_template(num_points: int, axes: int, kind: LineType, thickness_px: float) -> tuple[bytes, int, int]:
+    """One line on the wire with zeros for its numbers, and where the first coordinate and the first channel of colour stand."""
+    before = (b"\x08" + bytes([kind]) if kind else b"") + field(2, _IDENTITY_POSE)
+    before += b"\x19" + struct.pack("<d", thickness_px) + b"\x20\x01"  # scale_invariant
+    points = field(5, _doubles((0.0,) * axes)) * num_points
+    content = before + points + field(6, _doubles((0.0,) * 4))
+    template = field(11, content)
+    begin = len(template) - len(content) + len(before)
+    return template, begin + 3, begin + len(points) + 3
 
 
 def _encode_spheres(spheres: Spheres) -> bytes:
     """Repeated SpherePrimitive (field 9 of SceneEntity)."""
-    if not len(spheres.center_m):
+    num_spheres = len(spheres.center_m)
+    if not num_spheres:
         return b""
-    axis = [("tag", "u1"), ("value", "<f8")]
-    size, color = _vector(np.full(3, spheres.diameter_m)), np.zeros(1, _COLOR)
-    _fill_color(color, spheres.color[None])
-    after = field(2, size) + field(3, color.tobytes())
-    pose = 2 + 27 + len(_IDENTITY_POSE)
-    prefix = b"\x4a" + varint(2 + pose + len(after)) + bytes([0x0A, pose, 0x0A, 27])
-    sphere = np.dtype(
-        [("prefix", "u1", (len(prefix),)), ("axis", axis, (3,)), ("after", "u1", (len(_IDENTITY_POSE) + len(after),))]
-    )
-    wire = np.empty(len(spheres.center_m), dtype=sphere)
-    wire["prefix"] = np.frombuffer(prefix, np.uint8)
-    wire["axis"]["tag"] = (0x09, 0x11, 0x19)
-    wire["axis"]["value"] = spheres.center_m
-    wire["after"] = np.frombuffer(_IDENTITY_POSE + after, np.uint8)
-    return wire.tobytes()
+    template, first_axis = _sphere_template(spheres.diameter_m, tuple(spheres.color.tolist()))
+    wire = bytearray(template * num_spheres)
+    _numbers(wire, first_axis, (num_spheres, 3), (len(template), 9))[...] = spheres.center_m
+    return bytes(wire)
+
+
+@functools.lru_cache(maxsize=64)
+def _sphere_template(diameter_m: float, color: tuple[float, ...]) -> tuple[bytes, int]:
+    """One sphere at zero on the wire, and where its first coordinate stands."""
+    pose = field(1, _doubles((0.0, 0.0, 0.0))) + _IDENTITY_POSE
+    content = field(1, pose) + field(2, _doubles((diameter_m,) * 3)) + field(3, _doubles(color))
+    template = field(9, content)
+    return template, len(template) - len(content) + 5
 
 
 def _encode_label(label: Label) -> bytes:
     """TextPrimitive (field 13 of SceneEntity), 14 pixels high."""
-    color = np.zeros(1, _COLOR)
-    _fill_color(color, label.color[None])
-    pose = field(1, _vector(label.position_m)) + _IDENTITY_POSE
+    pose = field(1, _doubles(label.position_m.tolist())) + _IDENTITY_POSE
     body = field(1, pose) + b"\x10\x01" + b"\x19" + struct.pack("<d", 14.0) + b"\x20\x01"
-    return field(13, body + field(5, color.tobytes()) + field(6, label.text.encode()))
+    return field(13, body + field(5, _doubles(label.color.tolist())) + field(6, label.text.encode()))
 
 
-def _vector(value: Floats) -> bytes:
-    """Vector3 or Point3."""
-    return b"".join(bytes([number << 3 | DOUBLE]) + struct.pack("<d", float(value[number - 1])) for number in (1, 2, 3))
+def _doubles(value: Sequence[float]) -> bytes:
+    """A message of doubles alone, numbered from 1: Vector3, Point3, Color."""
+    return b"".join(struct.pack("<Bd", number << 3 | DOUBLE, one) for number, one in enumerate(value, start=1))
+
+
+def _numbers(wire: bytearray, offset: int, shape: tuple[int, ...], strides: tuple[int, ...]) -> npt.NDArray[np.float64]:
+    """The doubles that stand at equal distances in `wire`, to be assigned to."""
+    return np.ndarray(shape, "<f8", wire, offset, strides)
 
 
 _IDENTITY_POSE = field(2, b"\x21" + struct.pack("<d", 1.0))  # Pose with orientation w = 1
-
-_COLOR = np.dtype([("channel", [("tag", "u1"), ("value", "<f8")], (4,))])
-
-
-def _fill_color(wire: npt.NDArray[np.void], color: Floats) -> None:
-    wire["channel"]["tag"] = (0x09, 0x11, 0x19, 0x21)
-    wire["channel"]["value"] = color

@@ -128,7 +128,7 @@ def test_scene_is_self_contained_and_loses_agents_without_a_window(mission):
     future = [line for line in agent.lines if line.type == LinePrimitive.LINE_LIST]
     assert len(past) == len(future) == NUM_HYPOTHESES + 1
     assert all(len(line.points) % 2 == 0 for line in future)
-    assert len(past[0].points) + len(future[0].points) <= CONFIG.max_vertices
+    assert len(past[0].points) + len(future[0].points) <= 32
     assert past[-1].thickness > past[0].thickness, "the mean is drawn thicker"
     assert past[0].color.r < future[0].color.r, "the future is lighter"
 
