@@ -6,7 +6,8 @@ logs is evaluated with a forecasting checkpoint (`pipeline.forecasts`).
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -18,20 +19,28 @@ from torch import Tensor
 
 from cadence.constraints.checker import segments_in_collision, states_in_collision
 from cadence.errors import CadenceError, InputError, UsageError
-from cadence.types import HypothesisSet
+from cadence.types import Estimator, HypothesisSet, WindowBatch
+from pipeline.association import Sources, associated, build_way_windows
+from pipeline.config import read_config
 from pipeline.forecasts import ForecastConfig, evaluate_forecasts
+from pipeline.infer import InferConfig
+from pipeline.joint_scores import JointCells, JointScorer
 from pipeline.manifest import StageResult, read_manifest, run_stage, write_atomic
+from pipeline.matching import match_to_truth, matched_windows
 from pipeline.missions import is_mission_directory
 from pipeline.obstacles import OBSTACLES_NAME, read_obstacles
 from pipeline.progress import Progress
 from pipeline.results import MissionHypotheses, read_hypothesis_tables
 from pipeline.rivals import RIVALS, FittingData
 from pipeline.score_tables import OWN_NAME, ScoredMission, as_csv, as_json, as_markdown, headline, pool
-from pipeline.scores import IsInside, compare, score_in_chunks
+from pipeline.scores import Cells, Draw, IsInside, score_in_chunks
 from pipeline.tables import read_table
-from pipeline.windows import UNKNOWN_AGENT, Grid, MissionWindows, build_windows, truth_on_grid
+from pipeline.windows import UNKNOWN_AGENT, Float64s, Grid, MissionWindows, build_windows, truth_on_grid
 
+ASSOCIATIONS_NAME = "associations.parquet"
 _TRUTH_GAP_STEPS = 2.0
+_CUTOFF_STEPS = 16.0
+_LEAST_PROBABILITY = 0.5
 
 
 @dataclass(frozen=True)
@@ -41,6 +50,8 @@ class EvaluateConfig:
     rivals           out of `pipeline.rivals.RIVALS`, fitted to the mission's detections; empty: the hypotheses alone
     max_truth_gap_s  truth is interpolated between samples at most this far apart; by default two steps, or twice the median
                      time between truth samples where that is longer
+    gospa_cutoff_m   from this distance on an agent counts as missed and as false; by default the way that agents typically go
+                     between two detections
     num_resamples    bootstrap resamples of an interval
     seed             of the rivals' samples and of the bootstrap
     forecast         how a checkpoint is evaluated on a folder of logs
@@ -48,6 +59,7 @@ class EvaluateConfig:
 
     rivals: tuple[str, ...] = ("bank", "cv", "ou", "linear", "hold")
     max_truth_gap_s: float | None = None
+    gospa_cutoff_m: float | None = None
     num_resamples: int = 1000
     seed: int = 0
     forecast: ForecastConfig = field(default_factory=ForecastConfig)
@@ -56,8 +68,10 @@ class EvaluateConfig:
         unknown = [name for name in self.rivals if name not in RIVALS]
         if unknown:
             raise ValueError(f"rival {unknown[0]!r} is not known; known rivals: {', '.join(RIVALS)}")
-        if self.max_truth_gap_s is not None and not self.max_truth_gap_s > 0:
-            raise ValueError(f"max_truth_gap_s must be positive, got {self.max_truth_gap_s}")
+        for name in ("max_truth_gap_s", "gospa_cutoff_m"):
+            value = getattr(self, name)
+            if value is not None and not value > 0:
+                raise ValueError(f"{name} must be positive, got {value}")
         if self.num_resamples < 1:
             raise ValueError(f"num_resamples must be at least 1, got {self.num_resamples}")
 
@@ -95,7 +109,7 @@ def evaluate(directory: Path, config: EvaluateConfig, progress: Progress, force:
             f"{inputs[-1]}: not found, so there is nothing to score against; name a truth channel in [[extract.truth]] "
             "or thin a dense one (extract.thinning), then run extract and infer again"
         )
-    inputs += [path for path in [directory / OBSTACLES_NAME] if path.is_file()]
+    inputs += [path for name in (OBSTACLES_NAME, ASSOCIATIONS_NAME) if (path := directory / name).is_file()]
 
     def body(work: Path) -> Mapping[str, Any]:
         scored = score_mission(directory, config, progress)
@@ -131,43 +145,140 @@ def evaluate_folder(folder: Path, config: EvaluateConfig, progress: Progress) ->
 def score_mission(directory: Path, config: EvaluateConfig, progress: Progress) -> ScoredMission:
     """Cells of one mission directory, for the stored hypotheses and for the rivals of `config`."""
     stored = read_hypothesis_tables(directory)
-    detections, _ = read_table(directory / "detections.parquet", "detections")
-    truth, _ = read_table(directory / "truth.parquet", "truth")
-    grid = _stored_grid(stored, directory)
-    sigma_m = _infer_setting(directory, "default_sigma_m") or 0.0
-    windows = build_windows(detections, grid, config.seed, sigma_m)
-    truth = _named_like(truth, windows.agent_ids, directory)
-    max_gap_s = config.max_truth_gap_s or default_truth_gap_s(truth, grid.step_s)
-    truth_m, is_known = truth_on_grid(truth, windows, max_gap_s)
+    case = _case(directory, stored, config)
+    windows, scored = case.windows, case.scored
     num_hypotheses = max(len(window.hypothesis) for window in stored.windows)
 
-    def draw(index: Tensor) -> HypothesisSet:
+    def own_draw(index: Tensor) -> HypothesisSet:
         return _stored_hypotheses(stored, windows, index, num_hypotheses)
 
     collides = _collision_test(directory, windows)
     with progress.bar(windows.batch.num_windows * (1 + len(config.rivals)), "evaluate", "window") as bar:
-        own = score_in_chunks(draw, windows.batch, truth_m, is_known, num_hypotheses, collides, bar.update)
+
+        def score(draw: Draw, is_known: Tensor) -> tuple[Cells, JointCells]:
+            scorer = case.scorer()
+            watched = scorer.watch(draw) if case.is_joint else draw
+            cells = score_in_chunks(watched, scored, case.truth_m, is_known, num_hypotheses, collides, bar.update)
+            return cells, scorer.cells()
+
+        own, own_joint = score(own_draw, case.is_known)
         if not len(own):
             raise InputError(
-                f"{directory}: no step has both hypotheses and truth (truth samples at most {max_gap_s:g} s apart); "
+                f"{directory}: no step has both hypotheses and truth (truth samples at most {case.max_truth_gap_s:g} s apart); "
                 "check that the truth channel overlaps the detections in time, or set evaluate.max_truth_gap_s"
             )
-        is_scored = torch.zeros(is_known.shape[:2], dtype=torch.bool)
+        is_scored = torch.zeros(case.is_known.shape[:2], dtype=torch.bool)
         is_scored[torch.from_numpy(own.window.astype(np.int64)), torch.from_numpy(own.agent.astype(np.int64))] = True
-        data = FittingData.of(detections, grid, windows, sigma_m)
-        rivals = {name: RIVALS[name](data) for name in config.rivals}
-        cells = compare(rivals, windows.batch, truth_m, is_known & is_scored[..., None], num_hypotheses, collides, bar.update)
-    is_asked = is_known.any(dim=-1) & windows.batch.is_active
+        found = {OWN_NAME: (own, own_joint)}
+        for name in config.rivals:
+            draw = _rival_draw(RIVALS[name](case.fitting), windows.batch, num_hypotheses)
+            found[name] = score(draw, case.is_known & is_scored[..., None])
+            if len(found[name][0]) != len(own):
+                raise ValueError(f"{name} scored {len(found[name][0])} cells where {OWN_NAME} scored {len(own)}")
+    is_asked = case.is_known.any(dim=-1) & scored.is_active
     return ScoredMission(
         log_id=next((window.log_id for window in stored.windows), directory.name),
-        step_s=grid.step_s,
+        step_s=case.fitting.grid.step_s,
         num_windows=windows.batch.num_windows,
-        agent_ids=windows.agent_ids,
+        agent_ids=case.names,
         num_hypotheses=num_hypotheses,
-        max_truth_gap_s=max_gap_s,
+        max_truth_gap_s=case.max_truth_gap_s,
         num_unscored=int((is_asked & ~is_scored).sum()),
-        cells={OWN_NAME: own, **cells},
+        cells={name: cells for name, (cells, _) in found.items()},
+        joint={name: joint for name, (_, joint) in found.items()} if case.is_joint else {},
+        gospa_cutoff_m=case.cutoff_m if case.is_joint else None,
+        is_matched=case.is_matched,
     )
+
+
+def _rival_draw(rival: Estimator, windows: WindowBatch, num_hypotheses: int) -> Draw:
+    return lambda index: rival.sample(windows[index], num_hypotheses)
+
+
+@dataclass(frozen=True, eq=False)
+class _Case:
+    """What is compared with what.
+
+    windows     what rivals see: every agent's detections, those of unknown origin under the likeliest way
+    fitting     what rivals are fitted to
+    is_counted  [B, A] agents that are said to be there
+    names       of the J agents of the truth that are compared; match [B, J] which of the A each one is, -1: none
+    is_matched  whether they had to be matched, as the origin of detections is unknown
+    truth_m     [B, J, T, 2] about the datum, is_known [B, J, T]
+    """
+
+    windows: MissionWindows
+    fitting: FittingData
+    is_counted: Tensor
+    names: tuple[str, ...]
+    match: Tensor
+    is_matched: bool
+    truth_m: Tensor
+    is_known: Tensor
+    max_truth_gap_s: float
+    cutoff_m: float
+
+    @cached_property
+    def scored(self) -> WindowBatch:
+        """The windows by the agents of the truth."""
+        return matched_windows(self.windows.batch, self.match) if self.is_matched else self.windows.batch
+
+    @property
+    def is_joint(self) -> bool:
+        """Whether there is something to say of all agents together."""
+        return len(self.names) > 1 or self.is_matched
+
+    def scorer(self) -> JointScorer:
+        """What one estimator is scored with."""
+        return JointScorer(
+            self.windows.batch, self.is_counted, self.scored, self.match, self.truth_m, self.is_known, self.cutoff_m
+        )
+
+
+def _case(directory: Path, stored: MissionHypotheses, config: EvaluateConfig) -> _Case:
+    detections, _ = read_table(directory / "detections.parquet", "detections")
+    truth, _ = read_table(directory / "truth.parquet", "truth")
+    grid, infer = _stored_grid(stored, directory), _infer_config(directory)
+    is_matched = (directory / ASSOCIATIONS_NAME).is_file()
+    windows, fitting, probability = _seen(detections, grid, infer, config.seed, is_matched, stored)
+    if not is_matched:
+        truth = _named_like(truth, windows.agent_ids, directory)
+    names = tuple(sorted(pc.unique(truth["agent_id"]).to_pylist())) if is_matched else windows.agent_ids
+    max_gap_s = config.max_truth_gap_s or default_truth_gap_s(truth, grid.step_s)
+    truth_m, is_known = truth_on_grid(truth, replace(windows, agent_ids=names), max_gap_s)
+    cutoff_m = config.gospa_cutoff_m or _default_cutoff_m(truth_m, is_known)
+    match = torch.arange(len(names)).expand(len(truth_m), -1)
+    if is_matched:
+        match = match_to_truth(windows, truth, names, max_gap_s, cutoff_m)
+    is_counted = torch.from_numpy(~(probability <= _LEAST_PROBABILITY))
+    return _Case(windows, fitting, is_counted, names, match, is_matched, truth_m, is_known, max_gap_s, cutoff_m)
+
+
+def _seen(
+    detections: pa.Table, grid: Grid, infer: InferConfig, seed: int, is_associated: bool, stored: MissionHypotheses
+) -> tuple[MissionWindows, FittingData, Float64s]:
+    """Windows as they were inferred from, what to fit rivals to, and how likely each agent is there [B, A] (NaN: certain)."""
+    sigma_m = infer.default_sigma_m
+    if not is_associated:
+        windows = build_windows(detections, grid, seed, sigma_m)
+        fitting = FittingData.of(detections, grid, windows, sigma_m)
+        return windows, fitting, np.full(windows.batch.is_active.shape, np.nan)
+    # told apart anew: what was known at each origin is not kept in any table, and the same settings tell the same
+    max_speed_mps = infer.guidance.max_speed_mps
+    found = associated(detections, grid.origins_ns, infer.association, infer.seed, sigma_m, max_speed_mps)
+    sources = Sources(found.named(detections), grid, found)
+    num_hypotheses = max(len(window.hypothesis) for window in stored.windows)
+    ways = build_way_windows(detections, sources, infer.seed, num_hypotheses, sigma_m)
+    named = build_windows(sources.named, grid, seed, sigma_m)
+    fitting = FittingData.of(sources.named, grid, named, sigma_m)
+    reseeded = replace(ways.windows.batch, seeds=named.batch.seeds)
+    return replace(ways.windows, batch=reseeded), fitting, ways.probability
+
+
+def _default_cutoff_m(truth_m: Tensor, is_known: Tensor) -> float:
+    """The way that agents typically go in the gap between two detections: sixteen steps at their mean speed, at least 1 m."""
+    step_m = torch.linalg.vector_norm(truth_m.diff(dim=2), dim=-1)[is_known[..., 1:] & is_known[..., :-1]]
+    return max(1.0, _CUTOFF_STEPS * float(step_m.mean())) if len(step_m) else 1.0
 
 
 def default_truth_gap_s(truth: pa.Table, step_s: float) -> float:
@@ -187,10 +298,9 @@ def _stored_grid(stored: MissionHypotheses, directory: Path) -> Grid:
         raise InputError(f"{directory}: there are no hypotheses to score; see windows.parquet (status, advice) for the reasons")
     origins_ns = np.array([window.origin_ns for window in stored.windows], dtype=np.int64)
     first = drawn[0]
-    context_steps = _infer_setting(directory, "grid", "context_steps")
     return Grid(
         first.step_ns, first.origin_index + 1, first.num_steps - first.origin_index - 1, origins_ns,
-        None if context_steps is None else int(context_steps),
+        _infer_config(directory).grid.context_steps,
     )  # fmt: skip
 
 
@@ -210,12 +320,10 @@ def _collision_test(directory: Path, windows: MissionWindows) -> IsInside | None
     return collides
 
 
-def _infer_setting(directory: Path, *path: str) -> float | None:
-    """A number out of the configuration that infer ran with: rivals are given the same."""
-    value: Any = (read_manifest("infer", directory) or {}).get("config")
-    for key in path:
-        value = value.get(key) if isinstance(value, dict) else None
-    return float(value) if isinstance(value, int | float) else None
+def _infer_config(directory: Path) -> InferConfig:
+    """The configuration that infer ran with: rivals are given the same; the defaults where it cannot be told."""
+    config = (read_manifest("infer", directory) or {}).get("config")
+    return read_config(InferConfig, config, "infer") if isinstance(config, dict) else InferConfig()
 
 
 def _named_like(truth: pa.Table, agent_ids: tuple[str, ...], directory: Path) -> pa.Table:

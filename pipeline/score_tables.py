@@ -6,12 +6,13 @@ import io
 import json
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from pipeline.joint_scores import JOINT_METRICS, JointCells, block_of, summarise_joint
 from pipeline.scores import PARTS, Cells, ScoreRow, energy_ratio, groups_of, summarise
 
 OWN_NAME = "cadence"
@@ -24,6 +25,11 @@ _PART_METRICS = {
     "min_ade_m": "minADE m", "mean_error_m": "error of mean m", "coverage_50": "in 50 %", "coverage_90": "in 90 %",
     "spread_m": "spread m", "step_length_m": "step m", "true_step_length_m": "true step m", "collision_share": "collisions",
 }  # fmt: skip
+_JOINT_TITLES = {
+    "joint_energy_score_m": "joint energy m", "joint_min_ade_m": "joint minADE m", "gospa_m": "GOSPA m",
+    "localisation_error_m": "error of assigned m", "num_missed": "missed", "num_false": "false",
+}  # fmt: skip
+_WITH_INTERVAL = ("joint_energy_score_m", "joint_min_ade_m", "gospa_m")
 _SLICE_TITLES = {
     ("between", "gap"): "Past, by length of the gap between the detections around it",
     ("past", "nearest"): "Past, by time to the nearest detection",
@@ -39,6 +45,8 @@ class ScoredMission:
 
     cells         by estimator, OWN_NAME first; all in the same order
     num_unscored  (window, agent) pairs with truth and detections but without hypotheses: these are spared
+    joint         by estimator, scores of all agents together; empty for one agent
+    is_matched    detections are of unknown origin: agents were matched to those of the truth
     """
 
     log_id: str
@@ -49,6 +57,9 @@ class ScoredMission:
     max_truth_gap_s: float
     num_unscored: int
     cells: dict[str, Cells]
+    joint: dict[str, JointCells] = field(default_factory=dict)
+    gospa_cutoff_m: float | None = None
+    is_matched: bool = False
 
 
 @dataclass(frozen=True)
@@ -62,6 +73,8 @@ class ScoredLog:
     num_hypotheses: int
     max_truth_gap_s: float
     num_unscored: int
+    gospa_cutoff_m: float | None = None
+    is_matched: bool = False
 
 
 @dataclass(frozen=True)
@@ -96,6 +109,7 @@ def pool(missions: Sequence[ScoredMission], num_resamples: int, seed: int) -> Sc
     groups, grouped_by = _groups(missions)
     own = cells[names[0]]
     rows = [row for name in names for row in summarise(name, cells[name], groups, seed, num_resamples)]
+    rows += _joint_rows(missions, names, num_resamples, seed)
     ratios = []
     for rival in names[1:]:
         for part in PARTS:
@@ -105,11 +119,29 @@ def pool(missions: Sequence[ScoredMission], num_resamples: int, seed: int) -> Sc
     logs = tuple(
         ScoredLog(
             mission.log_id, mission.step_s, mission.num_windows, len(mission.agent_ids), mission.num_hypotheses,
-            mission.max_truth_gap_s, mission.num_unscored,
+            mission.max_truth_gap_s, mission.num_unscored, mission.gospa_cutoff_m, mission.is_matched,
         )
         for mission in missions
     )  # fmt: skip
     return ScoreReport(SCORES_VERSION, grouped_by, logs, tuple(rows), tuple(ratios))
+
+
+def _joint_rows(missions: Sequence[ScoredMission], names: Sequence[str], num_resamples: int, seed: int) -> list[ScoreRow]:
+    """Rows on all agents together, over the missions of several agents; resampled are these, or blocks of time in them."""
+    several = [mission for mission in missions if mission.joint]
+    rows: list[ScoreRow] = []
+    for name in names:
+        cells = [mission.joint[name] for mission in several]
+        if len(missions) >= _MIN_LOGS:
+            groups = [np.full(len(part), index) for index, part in enumerate(cells)]
+        else:
+            groups = [
+                block_of(part, mission.num_windows) + 1000 * index
+                for index, (part, mission) in enumerate(zip(cells, several, strict=True))
+            ]
+        if several:
+            rows += summarise_joint(name, JointCells.concatenate(cells), np.concatenate(groups), seed, num_resamples)
+    return rows
 
 
 def as_json(report: ScoreReport) -> str:
@@ -138,6 +170,7 @@ def as_markdown(report: ScoreReport) -> str:
     for part in PARTS:
         lines += _part_table(report, part)
     lines += _ratio_table(report)
+    lines += _joint_tables(report)
     for (part, by), title in _SLICE_TITLES.items():
         lines += _slice_table(report, part, by, title)
     return "\n".join(lines).rstrip() + "\n"
@@ -216,6 +249,44 @@ def _ratio_table(report: ScoreReport) -> list[str]:
     for rival in _ordered(row.rival for row in report.ratios):
         by_part = {row.part: row for row in report.ratios if row.rival == rival}
         lines.append(_line([rival, *(_with_interval(by_part.get(part)) for part in PARTS)]))
+    return [*lines, ""]
+
+
+def _joint_tables(report: ScoreReport) -> list[str]:
+    """A table a part: all agents of a window as one vector, and as a set."""
+    rows = [row for row in report.rows if row.by == "joint"]
+    if not rows:
+        return []
+    lines = ["## All agents together", "", *_joint_preface(report)]
+    for part in PARTS:
+        found = {(row.estimator, row.metric): row for row in rows if row.part == part}
+        shown = [name for name in JOINT_METRICS if any(metric == name for _, metric in found)]
+        if shown:
+            lines += [f"### {part.capitalize()}", "", _line(["estimator", *(_JOINT_TITLES[name] for name in shown), "windows"])]
+            lines.append(_line(["---"] * (len(shown) + 2)))
+        for estimator in _ordered(name for name, _ in found):
+            cells = [found.get((estimator, name)) for name in shown]
+            texts = [
+                (_with_interval if name in _WITH_INTERVAL else _value)(row) for name, row in zip(shown, cells, strict=True)
+            ]
+            lines.append(_line([estimator, *texts, str(max(row.num_cells for row in cells if row))]))
+        lines += [""] if shown else []
+    return lines
+
+
+def _joint_preface(report: ScoreReport) -> list[str]:
+    whole = "logs" if report.grouped_by == "log" else "ten blocks of time"
+    lines = [
+        f"Intervals: bootstrap over {whole}. Joint scores take all agents of a window as one vector. GOSPA (order 2) compares",
+        "the weighted mean positions with the truth as sets; missed and false are agents a step.",
+    ]
+    cutoffs = sorted({f"{log.gospa_cutoff_m:.3g} m" for log in report.logs if log.gospa_cutoff_m is not None})
+    lines[-1] += f" Cut-off: {', '.join(cutoffs[:5])}."
+    if any(log.is_matched for log in report.logs):
+        lines.append(
+            "Where detections are of unknown origin, agents are matched to those of the truth, window by window, by the "
+            "detections that they were given; rivals see the detections under the likeliest way to tell them apart."
+        )
     return [*lines, ""]
 
 

@@ -91,7 +91,8 @@ class Cells:
 class ScoreRow:
     """One number of a table: the mean of a metric over the cells of one slice, with its bootstrap interval.
 
-    by  "part" (of `PARTS`), or "horizon", "gap", "nearest", "age" with steps in (above_steps, up_to_steps]
+    by  "part" (of `PARTS`), "joint" (the same, all agents together), or "horizon", "gap", "nearest", "age" with steps in
+        (above_steps, up_to_steps]
     """
 
     estimator: str
@@ -114,19 +115,20 @@ def score_cells(
 
     Cells before an agent's first detection, of agents without detections, and of agents without hypotheses are left out.
     """
-    age, gap, nearest = _detection_distances(windows)
-    is_drawn = found.position_m[:, 0, :, 0, 0].isfinite()  # [B, A]
+    age, gap, nearest = detection_distances(windows)
+    found, weight = _filled_up(found)
+    is_drawn = weight.sum(dim=1) > 0  # [B, A]
     chosen = is_known & age.isfinite() & is_drawn[..., None]
     is_future = (windows.time_s > 0.5 * windows.step_s).expand_as(chosen)
     value = torch.full((*chosen.shape, len(METRICS)), torch.nan, dtype=torch.float64)
     rows, agents, steps = chosen.nonzero(as_tuple=True)
     at = found.position_m.double()[rows, :, agents, steps][:, :, None, None]  # [C, K, 1, 1, 2]
-    value[chosen] = _cell_values(at, found.weight.double()[rows], truth_m[chosen][:, None, None])
+    value[chosen] = _cell_values(at, weight[rows, :, agents], truth_m[chosen][:, None, None])
     for side in (~is_future, is_future):
-        _put_track_values(value, found, truth_m, chosen & side)
-    _put_step_lengths(value, found, truth_m, chosen)
+        _put_track_values(value, found.position_m, weight, truth_m, chosen & side)
+    _put_step_lengths(value, found.position_m, weight, truth_m, chosen)
     if inside is not None:
-        share = torch.einsum("bk,bkat->bat", found.weight.double(), inside.double())
+        share = torch.einsum("bka,bkat->bat", weight, inside.double())
         value[..., METRICS.index("collision_share")] = share
     window, agent, step = (index.numpy().astype(np.int32) for index in (rows, agents, steps - windows.origin_index))
     age_steps, gap_steps, nearest_steps = (side[chosen].numpy() for side in (age, gap, nearest))
@@ -220,6 +222,27 @@ def energy_ratio(
     )  # fmt: skip
 
 
+def weight_by_agent(found: HypothesisSet) -> Tensor:
+    """Weights of the hypotheses for each agent [B, K, A]: over those that it is part of (finite); zero without any."""
+    is_there = found.position_m[..., 0, 0].isfinite()
+    weight = found.weight.double()[..., None] * is_there
+    total = weight.sum(dim=1, keepdim=True)
+    shared = torch.where(total > 0, weight / torch.where(total > 0, total, 1.0), 0.0)
+    # An agent of every hypothesis keeps the weights as they are.
+    return torch.where(is_there.all(dim=1, keepdim=True), weight, shared)
+
+
+def _filled_up(found: HypothesisSet) -> tuple[HypothesisSet, Tensor]:
+    """Hypotheses without NaN where an agent has any at all, and weights by agent: zero for what was filled in."""
+    is_there = found.position_m[..., 0, 0].isfinite()
+    weight = weight_by_agent(found)
+    if bool((is_there.all(1) | ~is_there.any(1)).all()):
+        return found, weight
+    first = is_there.to(torch.int8).argmax(dim=1)[:, None, :, None, None]
+    one = found.position_m.gather(1, first.expand(-1, -1, -1, *found.position_m.shape[3:]))
+    return replace(found, position_m=torch.where(is_there[..., None, None], found.position_m, one)), weight
+
+
 def _cell_values(at: Tensor, weight: Tensor, truth_m: Tensor) -> Tensor:
     """What one cell tells by itself: at [C, K, 1, 1, 2], weight [C, K], truth_m [C, 1, 1, 2] -> [C, len(METRICS)]."""
     value = torch.full((len(at), len(METRICS)), torch.nan, dtype=torch.float64)
@@ -243,13 +266,13 @@ def _cell_values(at: Tensor, weight: Tensor, truth_m: Tensor) -> Tensor:
     return value
 
 
-def _put_track_values(value: Tensor, found: HypothesisSet, truth_m: Tensor, chosen: Tensor) -> None:
+def _put_track_values(value: Tensor, position_m: Tensor, weight: Tensor, truth_m: Tensor, chosen: Tensor) -> None:
     """What needs whole tracks: the best hypothesis over the chosen steps, and the score of the trajectory."""
     rows, agents = chosen.any(dim=-1).nonzero(as_tuple=True)
     if not len(rows):
         return
-    track = found.position_m.double()[rows, :, agents][:, :, None]  # [R, K, 1, T, 2]
-    weight, truth, known = found.weight.double()[rows], truth_m[rows, agents][:, None], chosen[rows, agents][:, None]
+    track = position_m.double()[rows, :, agents][:, :, None]  # [R, K, 1, T, 2]
+    weight, truth, known = weight[rows, :, agents], truth_m[rows, agents][:, None], chosen[rows, agents][:, None]
     best = torch.full_like(value[..., 0], torch.nan)
     best[rows, agents] = metrics.min_ade_distance(track, weight, truth, known)[:, 0]
     column = value[..., METRICS.index("min_ade_m")]
@@ -260,19 +283,19 @@ def _put_track_values(value: Tensor, found: HypothesisSet, truth_m: Tensor, chos
     )
 
 
-def _put_step_lengths(value: Tensor, found: HypothesisSet, truth_m: Tensor, chosen: Tensor) -> None:
+def _put_step_lengths(value: Tensor, position_m: Tensor, weight: Tensor, truth_m: Tensor, chosen: Tensor) -> None:
     """Mean length of the step that leads to a cell, where the cell before it counts too."""
     both = torch.zeros_like(chosen)
     both[..., 1:] = chosen[..., 1:] & chosen[..., :-1]
-    length = torch.linalg.vector_norm(found.position_m.double().diff(dim=3), dim=-1)
-    mean = torch.einsum("bk,bkat->bat", found.weight.double(), length)
+    length = torch.linalg.vector_norm(position_m.double().diff(dim=3), dim=-1)
+    mean = torch.einsum("bka,bkat->bat", weight, length)
     true = torch.linalg.vector_norm(truth_m.diff(dim=2), dim=-1)
     for name, steps in (("step_length_m", mean), ("true_step_length_m", true)):
         column = value[..., METRICS.index(name)]
         column[both] = steps[both[..., 1:]]
 
 
-def _detection_distances(windows: WindowBatch) -> tuple[Tensor, Tensor, Tensor]:
+def detection_distances(windows: WindowBatch) -> tuple[Tensor, Tensor, Tensor]:
     """Steps since the last detection, length of the enclosing gap, steps to the nearest detection, [B, A, T] each."""
     detections = windows.detections
     # A detection at a step's time belongs to it whatever the rounding of both to float seconds.

@@ -251,16 +251,21 @@ def truth_on_grid(truth: pa.Table, windows: MissionWindows, max_gap_s: float) ->
     tracks = dict(agent_tracks(truth, 0.0))
     for index, agent in enumerate(windows.agent_ids):
         if agent in tracks:
-            track = tracks[agent]
-            at = np.clip(np.searchsorted(track.time_ns, step_times), 1, max(len(track.time_ns) - 1, 1))
-            before, after = track.time_ns[at - 1], track.time_ns[np.minimum(at, len(track.time_ns) - 1)]
-            is_known = (before <= step_times) & (step_times <= after) & (after - before <= max_gap_s * 1e9)
-            share = (step_times - before) / np.maximum(after - before, 1)
-            first, second = track.position_m[at - 1], track.position_m[np.minimum(at, len(track.time_ns) - 1)]
-            value = first + share[..., None] * (second - first) - windows.datum_m[:, None]
-            position[:, index] = np.where(is_known[..., None], value, np.nan)
+            found, is_known = interpolated(tracks[agent], step_times, max_gap_s)
+            position[:, index] = np.where(is_known[..., None], found - windows.datum_m[:, None], np.nan)
     is_known_everywhere = np.isfinite(position[..., 0])
     return torch.from_numpy(np.nan_to_num(position)), torch.from_numpy(is_known_everywhere)
+
+
+def interpolated(track: DetectionTrack, time_ns: Int64s, max_gap_s: float) -> tuple[Float64s, npt.NDArray[np.bool_]]:
+    """Positions [..., 2] of a track at any times [...], and where they are known: between samples at most so far apart."""
+    at = np.clip(np.searchsorted(track.time_ns, time_ns), 1, max(len(track.time_ns) - 1, 1))
+    later = np.minimum(at, len(track.time_ns) - 1)
+    before, after = track.time_ns[at - 1], track.time_ns[later]
+    is_known = (before <= time_ns) & (time_ns <= after) & (after - before <= max_gap_s * 1e9)
+    share = (time_ns - before) / np.maximum(after - before, 1)
+    first, second = track.position_m[at - 1], track.position_m[later]
+    return first + share[..., None] * (second - first), is_known
 
 
 def _times_by_agent(table: pa.Table) -> list[Int64s]:
