@@ -85,6 +85,7 @@ class Association:
             then = agent_probability(self.ways[window])[at]
             detection, agent = np.nonzero(np.maximum(then, last[at]) >= _LEAST_PROBABILITY)
             rows = detections.take(pa.array(self.row[at[detection]]))
+            found["detection"] += self.row[at[detection]].tolist()
             for name in ("log_id", "time_ns", "topic", "log_time_ns", "sequence"):
                 found[name] += rows[name].to_pylist()
             found["agent_id"] += [self.agent_ids[a] if a < len(self.agent_ids) else None for a in agent]

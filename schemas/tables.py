@@ -72,6 +72,7 @@ WINDOWS = pa.schema(
 ASSOCIATIONS = pa.schema(
     [
         pa.field("log_id", pa.string(), nullable=False),
+        pa.field("detection", pa.int64(), nullable=False),  # row of DETECTIONS, from 0
         pa.field("time_ns", pa.int64(), nullable=False),
         pa.field("topic", pa.string(), nullable=False),  # topic, log time and sequence as in DETECTIONS
         pa.field("log_time_ns", pa.int64(), nullable=False),

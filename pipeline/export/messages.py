@@ -1,6 +1,7 @@
 """Messages of a side file: hypotheses (lossless, and read back), numbers a tick, detections, heat map, frames."""
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -54,6 +55,8 @@ def _encode_agent(agent: AgentHypotheses) -> bytes:
         spread_m=agent.spread_m,
         datum_x_m=agent.datum_m[0],
         datum_y_m=agent.datum_m[1],
+        probability=agent.probability,
+        association_entropy_bits=agent.association_entropy_bits,
     )
     position: bytes = np.ascontiguousarray(agent.position_m, dtype="<f4").tobytes()
     return bytes(head.SerializeToString()) + (field(9, position) if position else b"")
@@ -102,6 +105,8 @@ def _decode_agent(agent: Any, num_steps: int) -> AgentHypotheses:
         spread_m=_optional(agent, "spread_m"),
         datum_m=(agent.datum_x_m, agent.datum_y_m),
         position_m=np.array(agent.position_m, dtype=np.float32).reshape(-1, num_steps, 2),
+        probability=_optional(agent, "probability"),
+        association_entropy_bits=_optional(agent, "association_entropy_bits"),
     )
 
 
@@ -132,10 +137,13 @@ def _add_state(state: Any, live: LiveAgent, now_ns: int) -> None:
     state.speed_mps = numbers.speed_mps(live, now_ns)
     state.entropy = numbers.weight_entropy(live.weight)
     state.num_modes = live.num_modes
+    for name in ("probability", "association_entropy_bits"):
+        if getattr(agent, name) is not None:
+            setattr(state, name, getattr(agent, name))
 
 
-def encode_detection(row: dict[str, Any], frame: Frame, time_ns: int) -> bytes:
-    """cadence.Detection from a row of DETECTIONS."""
+def encode_detection(row: dict[str, Any], frame: Frame, time_ns: int, sources: Sequence[dict[str, Any]] = ()) -> bytes:
+    """cadence.Detection from a row of DETECTIONS, and where its origin is unknown from the rows of ASSOCIATIONS on it."""
     message = message_class("cadence.Detection")(frame_id=frame.frame_id)
     message.timestamp.FromNanoseconds(time_ns)
     for name in ("agent_id", "sensor_id", "x_m", "y_m", "num_merged", "topic", "log_time_ns", "sequence"):
@@ -144,6 +152,8 @@ def encode_detection(row: dict[str, Any], frame: Frame, time_ns: int) -> bytes:
     for name in ("z_m", "cov_xx_m2", "cov_xy_m2", "cov_yy_m2", "score"):
         if row[name] is not None and math.isfinite(row[name]):
             setattr(message, name, row[name])
+    if sources:
+        _add_association(message.association, sources)
     data: bytes = message.SerializeToString()
     return data
 
@@ -176,6 +186,18 @@ def encode_occupancy(tick: Tick, frame: Frame, time_ns: int, max_cells: int, z_m
     message.fields.add(name="alpha", offset=7, type=_UINT8)
     data: bytes = message.SerializeToString()
     return data
+
+
+def _add_association(association: Any, sources: Sequence[dict[str, Any]]) -> None:
+    for row in sorted(sources, key=lambda row: -row["probability"]):
+        if row["agent_id"] is None:
+            association.clutter_probability = row["probability"]
+        else:
+            association.agents.add(
+                id=row["agent_id"], probability=row["probability"], first_probability=row["first_probability"]
+            )
+    for name, column in (("entropy_bits", "probability"), ("first_entropy_bits", "first_probability")):
+        setattr(association, name, numbers.entropy_bits(np.array([row[column] for row in sources])))
 
 
 def encode_transform(frame: Frame, time_ns: int) -> bytes:

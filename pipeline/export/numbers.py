@@ -57,6 +57,12 @@ def weight_entropy(weight: Float64s) -> float:
     return float(np.clip(-(positive @ np.log(positive)) / np.log(len(weight)), 0.0, 1.0))
 
 
+def entropy_bits(probability: Float64s) -> float:
+    """Entropy of probabilities [N] in bits: 0 where one is certain, 1 for a coin."""
+    positive = probability[probability > 0]
+    return float(max(-(positive @ np.log2(positive)), 0.0)) if len(positive) else 0.0
+
+
 def count_modes(position_m: Float64s, weight: Float64s) -> int:
     """Separate groups among positions [K, 2]: links up to three typical distances between neighbours, a tenth of the weight."""
     if len(position_m) < 3:
@@ -93,9 +99,10 @@ def future_occupancy(live: tuple["LiveAgent", ...], max_cells: int) -> Occupancy
         column, row = np.moveaxis(np.floor(_dense(future, cell_m / 2.0) / cell_m).astype(np.int64) - first, -1, 0)
         is_visited[agent.hypothesis[:, None], row * width + column] = True
     weight = np.zeros(rows)
-    weight[live[0].hypothesis] = live[0].weight
-    for agent in live[1:]:  # windows of one origin may differ in their hypotheses
-        weight[agent.hypothesis] = np.maximum(weight[agent.hypothesis], agent.weight)
+    for agent in live:  # windows of one origin may differ in their hypotheses
+        # An agent that is part of some hypotheses only has their weights among all of them.
+        share = agent.weight if agent.agent.probability is None else agent.window.weight[agent.hypothesis]
+        weight[agent.hypothesis] = np.maximum(weight[agent.hypothesis], share)
     probability = np.clip(weight @ is_visited, 0.0, 1.0).reshape(height, width)
     return Occupancy(float(first[0] * cell_m), float(first[1] * cell_m), float(cell_m), probability)
 

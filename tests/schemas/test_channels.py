@@ -24,7 +24,7 @@ def test_descriptors_hold_their_imports_first():
     assert [file.name for file in files] == ["google/protobuf/timestamp.proto", "cadence.proto"]
 
 
-@pytest.mark.parametrize("name", ["Hypotheses", "AgentHypotheses", "Agents", "AgentState", "Detection"])
+@pytest.mark.parametrize("name", ["Hypotheses", "AgentHypotheses", "Agents", "AgentState", "Detection", "Association"])
 def test_messages_are_found(name):
     message = message_class(f"cadence.{name}")()
     assert message.DESCRIPTOR.full_name == f"cadence.{name}"
