@@ -60,6 +60,6 @@ def matched_windows(windows: WindowBatch, match: Tensor) -> WindowBatch:
     """Detections by the agents of the truth [B, J, N]; none where no agent stands for one."""
     found, row = windows.detections, torch.arange(len(match))[:, None]
     column = match.clamp_min(0)
-    fields = (found.time_s, found.position_m, found.covariance_m2)
+    time_s, position_m, covariance_m2 = (value[row, column] for value in (found.time_s, found.position_m, found.covariance_m2))
     is_observed = found.is_observed[row, column] & (match >= 0)[..., None]
-    return dataclasses.replace(windows, detections=Detections(*(value[row, column] for value in fields), is_observed))
+    return dataclasses.replace(windows, detections=Detections(time_s, position_m, covariance_m2, is_observed))

@@ -60,7 +60,7 @@ def weight_entropy(weight: Float64s) -> float:
 def entropy_bits(probability: Float64s) -> float:
     """Entropy of probabilities [N] in bits: 0 where one is certain, 1 for a coin."""
     positive = probability[probability > 0]
-    return float(max(-(positive @ np.log2(positive)), 0.0)) if len(positive) else 0.0
+    return max(float(-(positive @ np.log2(positive))), 0.0) if len(positive) else 0.0
 
 
 def count_modes(position_m: Float64s, weight: Float64s) -> int:
