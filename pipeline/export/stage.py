@@ -78,11 +78,15 @@ class ExportConfig:
 
 @dataclass(frozen=True, eq=False)
 class _Mission:
-    """All that is exported. Times are the clock of the detections; `clock_offset_ns` brings them to the log's."""
+    """All that is exported. Times are the clock of the detections; `clock_offset_ns` brings them to the log's.
+
+    `sources` holds the rows of ASSOCIATIONS by the row of their detection.
+    """
 
     catalogue: Catalogue
     hypotheses: MissionHypotheses
     detections: list[dict[str, Any]]
+    sources: dict[int, list[dict[str, Any]]]
     marks: tuple[Marks, ...]
     obstacles: list[dict[str, Any]]
     style: Style
@@ -102,6 +106,7 @@ def export(directory: Path, config: ExportConfig, progress: Progress, force: boo
         _check_combinable(catalogue)
     inputs = [directory / name for name in (CATALOGUE_NAME, *_TABLES, "obstacles.json")]
     inputs += [manifest_path(stage, directory) for stage in _EARLIER_STAGES if manifest_path(stage, directory).is_file()]
+    inputs += [path for path in [directory / "associations.parquet"] if path.is_file()]
     inputs += [catalogue.path] if config.combined else []
 
     def body(work: Path) -> dict[str, Any]:
@@ -148,7 +153,7 @@ def _export(directory: Path, work: Path, catalogue: Catalogue, config: ExportCon
 def _read_mission(directory: Path, catalogue: Catalogue, config: ExportConfig) -> _Mission:
     hypotheses = read_hypothesis_tables(directory)
     table, _ = read_table(directory / "detections.parquet", "detections")
-    table = table.sort_by([("time_ns", "ascending")])
+    table = table.append_column("row", pa.array(np.arange(table.num_rows))).sort_by([("time_ns", "ascending")])
     obstacles = _read_obstacles(directory / "obstacles.json")
     scenes = build_scenes(hypotheses)
     offset_ns = _clock_offset_ns(table)
@@ -159,6 +164,7 @@ def _read_mission(directory: Path, catalogue: Catalogue, config: ExportConfig) -
         catalogue=catalogue,
         hypotheses=hypotheses,
         detections=table.to_pylist(),
+        sources=_read_sources(directory / "associations.parquet"),
         marks=_marks(table),
         obstacles=obstacles,
         style=style,
@@ -179,6 +185,14 @@ def _read_obstacles(path: Path) -> list[dict[str, Any]]:
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise InputError(f"{path}: cannot be read ({error}); run extract again with --force") from error
     return obstacles
+
+
+def _read_sources(path: Path) -> dict[int, list[dict[str, Any]]]:
+    """Who may have caused each detection of unknown origin; empty where infer told none apart."""
+    found: dict[int, list[dict[str, Any]]] = {}
+    for row in read_table(path, "associations")[0].to_pylist() if path.is_file() else ():
+        found.setdefault(row["detection"], []).append(row)
+    return found
 
 
 def _clock_offset_ns(detections: pa.Table) -> int:
@@ -296,7 +310,7 @@ def _static(mission: _Mission, time_ns: int) -> Iterator[_Message]:
 
 def _detection(mission: _Mission, row: dict[str, Any], time_ns: int) -> Iterator[_Message]:
     frame = mission.hypotheses.frame
-    yield time_ns, channels.DETECTIONS, messages.encode_detection(row, frame, time_ns)
+    yield time_ns, channels.DETECTIONS, messages.encode_detection(row, frame, time_ns, mission.sources.get(row["row"], ()))
     if frame.is_georeferenced:
         data = maps.encode_detection_fix(row, frame, mission.style, time_ns)
         yield time_ns, channels.detection_fix_channel(row["agent_id"]), data

@@ -17,6 +17,7 @@ import pyarrow as pa
 
 from cadence.errors import InputError
 from pipeline.manifest import hash_file, read_manifest
+from pipeline.report.origins import Origins, origins_of, with_likeliest
 from pipeline.results import AgentHypotheses, MissionHypotheses, WindowHypotheses, read_hypothesis_tables
 from pipeline.tables import Frame, read_table
 
@@ -111,6 +112,7 @@ class Mission:
 
     start_ns, end_ns          of what is drawn: detections, truth, window origins
     log_start_ns, log_end_ns  of the log, where it keeps the same clock
+    origins                   who was found among detections of unknown origin; these are given to their likeliest agent
     """
 
     name: str
@@ -131,6 +133,7 @@ class Mission:
     end_ns: int
     log_start_ns: int
     log_end_ns: int
+    origins: Origins | None = None
 
     @property
     def num_tracked(self) -> int:
@@ -152,7 +155,13 @@ class Mission:
 def mission_inputs(directory: Path) -> list[Path]:
     """The files of `directory` that the page depends on, as far as they exist."""
     names = ["catalogue.json", "detections.parquet", "hypotheses.parquet", "windows.parquet", "obstacles.json"]
-    names += ["truth.parquet", "poses.parquet", "scores.json", *(f"{stage}.manifest.json" for stage in STAGES)]
+    names += [
+        "associations.parquet",
+        "truth.parquet",
+        "poses.parquet",
+        "scores.json",
+        *(f"{stage}.manifest.json" for stage in STAGES),
+    ]
     return [directory / name for name in names if (directory / name).is_file()]
 
 
@@ -161,6 +170,9 @@ def load_mission(directory: Path) -> Mission:
     catalogue = _read_json(directory / "catalogue.json")
     detections, frame = read_table(directory / "detections.parquet", "detections")
     hypotheses = read_hypothesis_tables(directory)
+    associations = _optional_table(directory, "associations")
+    origins = None if associations is None else origins_of(detections, associations)
+    detections = detections if associations is None else with_likeliest(detections, associations)
     truth = _optional_table(directory, "truth")
     poses = _optional_table(directory, "poses")
     tables = [table for table in (detections, truth) if table is not None]
@@ -192,6 +204,7 @@ def load_mission(directory: Path) -> Mission:
         end_ns=end_ns,
         log_start_ns=log_start_ns,
         log_end_ns=log_end_ns,
+        origins=origins,
     )
 
 

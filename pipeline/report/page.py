@@ -12,6 +12,7 @@ from pipeline.report.clock import Clock, duration
 from pipeline.report.health import health_section
 from pipeline.report.markup import inline_json, legend, section, text
 from pipeline.report.mission import UNKNOWN_AGENT, Mission
+from pipeline.report.origins import origins_section
 from pipeline.report.payload import Payload
 from pipeline.report.provenance import provenance_section
 from pipeline.report.sections import moments_section, trouble_section, uncertainty_section
@@ -58,6 +59,7 @@ def write_page(mission: Mission, analysis: Analysis, payload: Payload, moments: 
         _reading(mission),
         _explorer(mission, payload),
         moments_section(mission, analysis, moments),
+        origins_section(mission.origins, mission.start_ns, mission.end_ns),
         uncertainty_section(mission, analysis),
         truth_section(mission, analysis),
         trouble_section(mission),
@@ -91,7 +93,7 @@ def _facts(mission: Mission) -> list[tuple[str, str, str]]:
     is_unknown = mission.detections.owner < 0
     if UNKNOWN_AGENT in mission.agents:
         is_unknown |= mission.detections.owner == mission.agents.index(UNKNOWN_AGENT)
-    unknown = int(is_unknown.sum())
+    unknown = int(is_unknown.sum()) if mission.origins is None else mission.origins.num_detections
     others = len(mission.agents) - mission.num_tracked
     facts = [
         ("Agents", f"{mission.num_tracked:,}", f"{others:,} more only in the truth" if others else ""),

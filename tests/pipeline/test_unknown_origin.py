@@ -8,18 +8,23 @@ import numpy as np
 import pyarrow as pa
 import pytest
 import torch
+from mission_fixture import build_mission
 
 from cadence.association.types import AssociationConfig, Associations
 from cadence.errors import InputError
 from cadence.types import HypothesisSet, WindowBatch
 from pipeline import association
 from pipeline.association import WayWindows, build_way_windows, shared_out, tell_sources
+from pipeline.export import ExportConfig, export, read_hypotheses
 from pipeline.infer import InferConfig, infer
+from pipeline.logs.reader import open_log
 from pipeline.progress import Progress
+from pipeline.report import ReportConfig, report
 from pipeline.results import read_hypothesis_tables
 from pipeline.tables import Frame, read_table, write_table
 from pipeline.way_draws import draw_ways
 from pipeline.windows import UNKNOWN_AGENT, GridConfig
+from schemas.channels import message_class
 from schemas.tables import ASSOCIATIONS, DETECTIONS
 
 QUIET = Progress(quiet=True)
@@ -213,3 +218,46 @@ def test_the_real_filter_finds_both_agents_and_repeats_itself(tmp_path: Path) ->
     south = {row["agent_id"] for row in rows if row["sequence"] % 2 == 0}
     north = {row["agent_id"] for row in rows if row["sequence"] % 2 == 1}
     assert len(south) == len(north) == 1 and south != north
+
+
+def test_side_file_and_page_tell_of_agents_and_sources(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    directory = build_mission(tmp_path)
+    table, frame = read_table(directory / "detections.parquet", "detections")
+    true = np.array([int(name[1:]) for name in table["agent_id"].to_pylist()])
+    column = table.schema.get_field_index("agent_id")
+    table = table.set_column(column, table.schema.field(column), pa.nulls(len(true), pa.string()))
+    write_table(table, directory / "detections.parquet", "detections", frame)
+
+    def associate(time_s, position_m, covariance_m2, origins_s, config, seed, habits=None) -> list[Associations]:
+        label = np.stack([true, np.where(np.arange(len(true)) % 5 == 0, -1, true), np.where(true == 1, -1, true)])
+        return [Associations(label[:, : int((time_s <= o).sum())], np.array([0.5, 0.25, 0.25]), 2) for o in origins_s]
+
+    monkeypatch.setattr(association, "associate", associate)
+    monkeypatch.setattr(association, "fit_habits", lambda *_: None)
+    infer(directory, CONFIG, QUIET)
+    written = read_hypothesis_tables(directory)
+    export(directory, ExportConfig(), QUIET)
+    back = read_hypotheses(directory / "patrol.cadence.mcap")
+    assert back.agent_ids == ("a0", "a1")
+    for ours, theirs in zip(back.windows, written.windows, strict=True):
+        for agent, expected in zip(ours.agents, theirs.agents, strict=True):
+            assert agent.position_m.tobytes() == expected.position_m.tobytes()
+            assert (agent.probability, agent.association_entropy_bits) == (
+                expected.probability,
+                expected.association_entropy_bits,
+            )
+    log = open_log(directory / "patrol.cadence.mcap")
+    kind, states = message_class("cadence.Detection"), message_class("cadence.Agents")
+    found = [kind.FromString(raw.data) for raw in log.messages({"/cadence/detections"})]
+    assert len(found) == len(true) and all(message.agent_id == "" for message in found)
+    for number, message in enumerate(found):
+        chance = {agent.id: agent.probability for agent in message.association.agents}
+        clutter = 0.25 * (number % 5 == 0) + 0.25 * (true[number] == 1)
+        assert chance == {f"a{true[number]}": 1.0 - clutter} and message.association.clutter_probability == clutter
+        bits = -sum(p * np.log2(p) for p in (clutter, 1.0 - clutter) if p > 0)
+        assert message.association.entropy_bits == pytest.approx(bits)
+    ticks = [states.FromString(raw.data) for raw in log.messages({"/cadence/agents"})]
+    assert {(a.id, a.probability) for tick in ticks for a in tick.agents} == {("a0", 1.0), ("a1", 0.75)}
+    report(directory, ReportConfig(), QUIET)
+    page = (directory / "report.html").read_text()
+    assert "Agents of unknown origin" in page and f"{int((true == 0).sum())} of {len(true)}" in page
