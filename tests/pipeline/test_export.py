@@ -1,5 +1,7 @@
 import hashlib
 import json
+import os
+import shutil
 import subprocess
 import sys
 from collections import Counter
@@ -18,6 +20,7 @@ from mcap_protobuf.decoder import DecoderFactory
 from mission_fixture import (
     DURATION_NS,
     FIRST_ORIGIN_NS,
+    FRAME,
     GEOREFERENCED,
     NUM_HYPOTHESES,
     NUM_WINDOWS,
@@ -30,6 +33,7 @@ from mission_fixture import (
 from cadence.errors import InputError
 from pipeline.export import ExportConfig, export, numbers, read_hypotheses
 from pipeline.export.playback import Scene, plan_ticks
+from pipeline.export.stage import num_vertices
 from pipeline.frames import to_local
 from pipeline.progress import Progress
 from pipeline.results import read_hypothesis_tables
@@ -299,6 +303,25 @@ def test_damaged_source_gives_one_line_and_no_file(tmp_path):
     assert not [path for path in directory.iterdir() if path.name.startswith(".")]
 
 
+def test_log_that_was_damaged_when_it_was_ingested_is_not_combined(tmp_path):
+    (tmp_path / "sound").mkdir()
+    build_mission(tmp_path / "sound")
+    log = tmp_path / "patrol.mcap"
+    log.write_bytes((tmp_path / "sound" / "patrol.mcap").read_bytes()[:-3000])
+    directory = build_mission(tmp_path, log=log)
+    with pytest.raises(InputError, match=r"patrol\.mcap: is damaged .* export without combined") as caught:
+        export(directory, ExportConfig(combined=True), QUIET)
+    assert "\n" not in str(caught.value)
+    assert export(directory, CONFIG, QUIET).status == "done"
+    assert not (directory / "patrol.combined.mcap").exists()
+
+
+def test_scenes_that_change_each_time_have_fewer_points():
+    assert num_vertices(100, 120, ExportConfig()) == 15
+    assert num_vertices(100, 1000, ExportConfig()) == 32
+    assert num_vertices(100, 120, ExportConfig(max_vertices=40)) == 40
+
+
 @pytest.mark.parametrize(
     "name", ["hypotheses.parquet", "windows.parquet", "detections.parquet", "catalogue.json", "obstacles.json"]
 )
@@ -431,9 +454,14 @@ def test_config_is_checked(bad):
         ExportConfig(**bad)
 
 
-def test_rerun_accepts_the_files(mission, georeferenced):
-    rerun = Path(sys.executable).with_name("rerun")
-    if not rerun.exists():
+def test_rerun_accepts_the_files(tmp_path):
+    rerun = shutil.which("rerun", path=os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")]))
+    if rerun is None:
         pytest.skip("rerun-sdk is not installed (development only)")
-    for directory in (mission, georeferenced):
-        subprocess.run([rerun, "mcap", "check", directory / "patrol.cadence.mcap"], check=True, capture_output=True, timeout=60)
+    for frame in (FRAME, GEOREFERENCED):
+        (tmp_path / frame.frame_id).mkdir()
+        directory = build_mission(tmp_path / frame.frame_id, frame=frame)
+        export(directory, ExportConfig(combined=True), QUIET)
+        for kind in ("cadence", "combined"):
+            command = [rerun, "mcap", "check", "--full", directory / f"patrol.{kind}.mcap"]
+            subprocess.run(command, check=True, capture_output=True, timeout=60)
