@@ -1,4 +1,4 @@
-"""The section on detections of unknown origin: which agents were found, how many detections are theirs, and how sure that is."""
+"""The section on detections of unknown origin: which agents were found, how many detections are theirs, how sure that is."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -40,7 +40,7 @@ class Origins:
 
 
 def likeliest_sources(associations: pa.Table) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of every detection in ASSOCIATIONS: its row in DETECTIONS [N], its likeliest source (None: clutter) and how likely [N]."""
+    """Of every detection in ASSOCIATIONS: row in DETECTIONS [N], likeliest source (None: clutter) [N], and how likely [N]."""
     detection, probability = associations["detection"].to_numpy(), associations["probability"].to_numpy()
     order = np.lexsort((-probability, detection))
     first = order[np.append(True, np.diff(detection[order]) > 0)] if len(order) else order
@@ -86,9 +86,10 @@ def origins_section(origins: Origins | None, start_ns: int, end_ns: int) -> str:
         content += f"<details><summary>{len(rows) - OPEN_ROWS} more agents</summary>{rest}</details>"
     sure = sum(agent.num_sure for agent in origins.agents)
     lead = (
-        f"The log does not say who caused {origins.num_detections:,} of its detections. {len(origins.agents):,} agents explain them "
-        f"best; {origins.num_clutter:,} detections are rather nobody’s. Of {sure:,} it is at least 90 % sure whose they are, as known "
-        "at the end of the log. Hypotheses differ in whose the others are; elsewhere on this page each is shown with the likeliest."
+        f"The log does not say who caused {origins.num_detections:,} of its detections. {len(origins.agents):,} agents explain "
+        f"them best; {origins.num_clutter:,} detections are rather nobody’s. Of {sure:,} it is at least 90 % sure whose they are, "
+        "as known at the end of the log. Hypotheses differ in whose the others are; elsewhere on this page each is shown with "
+        "its likeliest agent."
     )
     return section("Agents of unknown origin", content, lead)
 
