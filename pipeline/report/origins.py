@@ -88,8 +88,8 @@ def origins_section(origins: Origins | None, start_ns: int, end_ns: int) -> str:
     lead = (
         f"The log does not say who caused {origins.num_detections:,} of its detections. {len(origins.agents):,} agents explain "
         f"them best; {origins.num_clutter:,} detections are rather nobody’s. Of {sure:,} it is at least 90 % sure whose they "
-        "are, as known at the end of the log. Hypotheses differ in whose the others are; elsewhere on this page each is shown with "
-        "its likeliest agent."
+        "are, as known at the end of the log. Hypotheses differ in whose the others are; elsewhere on this page each is shown "
+        "with its likeliest agent."
     )
     return section("Agents of unknown origin", content, lead)
 
