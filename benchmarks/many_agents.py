@@ -107,7 +107,8 @@ HEAD = f"""# How much memory do many agents take?
 
 `cadence run` (all stages) on one log of {NUM_AGENTS} simulated smugglers, {NUM_HYPOTHESES} hypotheses a window,
 {NUM_THREADS} threads, no GPU. Peak of the resident memory as the operating system counts it (ru_maxrss), each run in a
-process of its own. GB are 10^9 bytes. Tracks are the rows of hypotheses.parquet: a track for each window, hypothesis and agent that was detected within the window.
+process of its own. GB are 10^9 bytes. Tracks are the rows
+of hypotheses.parquet: a track for each window, hypothesis and agent that was detected within the window.
 
 | checkpoint | agents | windows | tracks | wall time, s | peak, GB |
 |---|---|---|---|---|---|
