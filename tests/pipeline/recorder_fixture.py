@@ -6,7 +6,7 @@ import random
 from mcap.reader import NonSeekingReader
 from mcap.writer import CompressionType, IndexType, Writer
 
-from pipeline.logs.reader import MissionLog
+from pipeline.logs.reader import MissionLog, RawMessage
 
 START_NS = 10**18
 STEP_NS = 10**8
@@ -52,10 +52,12 @@ def recording(
 
 def content(log: MissionLog, topics=None):
     """All that a message carries, in the order of the log."""
-    return [
-        (m.channel.topic, m.channel.schema_name, m.channel.schema_data, m.log_time_ns, m.publish_time_ns, m.sequence, m.data)
-        for m in log.messages(topics)
-    ]
+    return [carried(message) for message in log.messages(topics)]
+
+
+def carried(m: RawMessage):
+    """All that one message carries."""
+    return m.channel.topic, m.channel.schema_name, m.channel.schema_data, m.log_time_ns, m.publish_time_ns, m.sequence, m.data
 
 
 def reference(data: bytes, topics=None):
