@@ -1,9 +1,9 @@
 """Several targets at once: what knowing whose a detection is, and drawing all agents together, are worth.
 
 Held-out episodes of the world rendezvous: three agents who meet before their goal or do not, detected in 10 to 12 % of the
-steps. Four networks of one size, trained alike: with known and unknown origin, with attention between agents and without. Without
-attention and with known origin a network is the single-target model, agent by agent. Beside them the shipped network, which
-was trained longer: with known origin, and with detections of unknown origin told apart first (several ways of weight).
+steps. Four networks of one size, trained alike: with known and unknown origin, with attention between agents and without.
+Without attention and with known origin a network is the single-target model, agent by agent. Beside them the shipped network,
+which was trained longer: with known origin, and with detections of unknown origin told apart first (several ways of weight).
 
     python benchmarks/rendezvous.py --publish docs
 """
