@@ -106,11 +106,13 @@ def _columns(
     left: tuple[_Panel, ...] = (scene,)
     if frame.is_georeferenced:
         left += (_Panel("Map", "map", "Map", _map_config(style, source, topics), 1.0),)
-    right = (
+    right: tuple[_Panel, ...] = (
         _Panel("Plot", "Plot", "Spread (m)", _plot_config(_spread_series(style)), 1.0),
         _Panel("Plot", "Plot", "Detections", _plot_config(_detection_series(style)), 1.0),
-        _Panel("RawMessages", "RawMessages", "Agents", {"topicPath": channels.AGENTS.topic, "diffEnabled": False}, 1.0),
     )
+    if style.has_unknown_origin:
+        right += (_Panel("Plot", "Plot", "Association", _plot_config(_association_series(style)), 1.0),)
+    right += (_Panel("RawMessages", "RawMessages", "Agents", {"topicPath": channels.AGENTS.topic, "diffEnabled": False}, 1.0),)
     return (2.0, left), (1.0, right)
 
 
@@ -198,6 +200,16 @@ def _detection_series(style: Style) -> Iterable[Json]:
         yield _series(f"{agent}.age_s", f"{agent_id} age (s)", style.hue(agent_id), line_size=1)
         detection = f"{channels.DETECTIONS.topic}{_filter('agent_id', agent_id)}.num_merged"
         yield _series(detection, f"{agent_id} detected", style.hue(agent_id), line_size=3) | {"showLine": False}
+
+
+def _association_series(style: Style) -> Iterable[Json]:
+    """How likely each agent is to be there, how open the origin of its detections is, and of each detection its share in it."""
+    for agent_id in style.agent_ids[:_MAX_SERIES_AGENTS]:
+        agent = f"{channels.AGENTS.topic}.agents[:]{_filter('id', agent_id)}"
+        yield _series(f"{agent}.probability", f"{agent_id} is there", style.hue(agent_id), line_size=2)
+        yield _series(f"{agent}.association_entropy_bits", f"{agent_id} entropy (bit)", style.hue(agent_id), line_size=1)
+        source = f"{channels.DETECTIONS.topic}.association.agents[:]{_filter('id', agent_id)}"
+        yield _series(f"{source}.probability", f"{agent_id} detected", style.hue(agent_id), line_size=3) | {"showLine": False}
 
 
 def _series(path: str, label: str, color: str, line_size: int) -> Json:

@@ -34,7 +34,7 @@ class Marks:
 
 @dataclass(frozen=True)
 class Style:
-    """What the whole mission has in common: colours by agent, size of the scene, height, detail."""
+    """What the whole mission has in common: colours by agent, size, height, detail, whether origins are unknown."""
 
     agent_ids: tuple[str, ...]
     center_m: tuple[float, float]
@@ -42,6 +42,7 @@ class Style:
     z_m: float
     num_hypotheses: int
     max_vertices: int
+    has_unknown_origin: bool = False
 
     def hue(self, agent_id: str) -> str:
         """The colour of an agent as #RRGGBB; grey for one that was never inferred."""

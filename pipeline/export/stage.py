@@ -249,6 +249,7 @@ def _style(hypotheses: MissionHypotheses, detections: pa.Table, config: ExportCo
         z_m=round(float(z_m.mean()), 1) if len(z_m) else 0.0,
         num_hypotheses=config.num_scene_hypotheses,
         max_vertices=vertices,
+        has_unknown_origin=any(agent.probability is not None for window in hypotheses.windows for agent in window.agents),
     )
 
 

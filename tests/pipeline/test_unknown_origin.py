@@ -258,6 +258,9 @@ def test_side_file_and_page_tell_of_agents_and_sources(tmp_path: Path, monkeypat
         assert message.association.entropy_bits == pytest.approx(bits)
     ticks = [states.FromString(raw.data) for raw in log.messages({"/cadence/agents"})]
     assert {(a.id, a.probability) for tick in ticks for a in tick.agents} == {("a0", 1.0), ("a1", 0.75)}
+    layout = (directory / "patrol.layout.json").read_text()
+    for series in ("/cadence/detections.association.agents[:]", "probability", "association_entropy_bits"):
+        assert series in layout
     report(directory, ReportConfig(), QUIET)
     page = (directory / "report.html").read_text()
     assert "Agents of unknown origin" in page and f"{int((true == 0).sum())} of {len(true)}" in page
