@@ -42,6 +42,15 @@ _FUNCTIONS_OF_TWO: Mapping[str, Callable[[float, float], float]] = {
 class MissingFieldError(LookupError):
     """A message has no such field or item; `str(error)` names it and, where known, the fields that are there."""
 
+    def __init__(self, what: str, parent: Any = None) -> None:
+        super().__init__(what)
+        self._parent = parent
+
+    def __str__(self) -> str:
+        # Only now: most of these errors end where an alternative path is tried, and are never read.
+        known = field_names(self._parent)
+        return f"{self.args[0]}; fields there: {', '.join(known)}" if known else str(self.args[0])
+
 
 @dataclass(frozen=True)
 class Field:
@@ -164,27 +173,36 @@ class MessagePath:
                 message = follow(message)
             return {(): message}
         items: dict[Place, Any] = {(): message}
-        missing: MissingFieldError | None = None
+        missing: list[MissingFieldError] = []
         for step in self.steps:
-            kept: dict[Place, Any] = {}
-            for place, item in items.items():
-                try:
-                    if isinstance(step, Slice):
-                        kept.update(((*place, index), element) for index, element in step.elements(item))
-                    elif not isinstance(step, Filter):
-                        kept[place] = step.of(item)
-                    elif step.keeps(item):
-                        kept[place] = item
-                except MissingFieldError as error:
-                    missing = error
-            items = kept
-        if not items and missing is not None:
-            raise missing
+            if isinstance(step, Filter):
+                items = {place: item for place, item in items.items() if step.keeps(item)}
+            else:
+                items = _followed(step, items, missing)
+        if not items and missing:
+            raise missing[-1]
         return items
 
     def values(self, message: Any) -> list[Any]:
         """The values without their places; errors as in `located`."""
         return list(self.located(message).values())
+
+
+def _followed(
+    step: Field | Index | Function | Slice, items: dict[Place, Any], missing: list[MissingFieldError]
+) -> dict[Place, Any]:
+    """Where one step leads from every item; what is lacking is added to `missing`."""
+    found: dict[Place, Any] = {}
+    for place, item in items.items():
+        try:
+            if isinstance(step, Slice):
+                for index, element in step.elements(item):
+                    found[(*place, index)] = element
+            else:
+                found[place] = step.of(item)
+        except MissingFieldError as error:
+            missing.append(error)
+    return found
 
 
 def at_place(values: Mapping[Place, Any], place: Place) -> Any:
@@ -283,9 +301,7 @@ def _field(item: Any, name: str) -> Any:
     except (KeyError, AttributeError) as error:
         if hasattr(item, name + "_"):  # named like a Python keyword
             return getattr(item, name + "_")
-        known = field_names(item)
-        hint = f"; fields there: {', '.join(known)}" if known else ""
-        raise MissingFieldError(f"no field {name!r}{hint}") from error
+        raise MissingFieldError(f"no field {name!r}", item) from error
 
 
 def field_names(item: Any) -> list[str]:

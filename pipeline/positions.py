@@ -104,9 +104,14 @@ class FieldReader:
         self.paths = [parse_path(text) for text in texts]
         self.is_needed = is_needed
         self.is_found = False
-        self.problem = ""
+        self._problem: tuple[str, MissingFieldError] | None = None
         self._convert = convert
         self._order = list(range(len(self.paths)))
+
+    @property
+    def problem(self) -> str:
+        """What the last path that led nowhere was lacking."""
+        return "path {!r}: {}".format(*self._problem) if self._problem is not None else "it"
 
     def located(self, message: Any) -> Mapping[Place, Any] | None:
         """The values by place; None where no alternative leads anywhere."""
@@ -115,7 +120,7 @@ class FieldReader:
             try:
                 values = self.paths[number].located(message)
             except MissingFieldError as error:
-                self.problem = f"path {self.paths[number].text!r}: {error}"
+                self._problem = self.paths[number].text, error
                 continue
             self.is_found = True
             if self._convert is not None:
@@ -147,7 +152,8 @@ class ChannelReader:
                 tuple(self._field(name, (text,)) for name, text in zip(names, texts, strict=True))
                 for texts in zip(*alternatives, strict=True)
             ]
-        self.fields = {name: self._field(name, getattr(paths, name)) for name in _OTHERS}
+        fields = {name: self._field(name, getattr(paths, name)) for name in _OTHERS}
+        self.fields = {name: reader for name, reader in fields.items() if reader.paths}
         self.unknown = NONE_COVARIANCE if source.sigma_m is None else isotropic(source.sigma_m**2)
         self.rows = Rows()
         self.counts: Counter[str] = Counter()
@@ -169,10 +175,12 @@ class ChannelReader:
         if points is None:
             self.counts["incomplete"] += 1
             return
-        found = {name: reader.located(message) or {} if reader.paths else {} for name, reader in self.fields.items()}
+        found = [(name, located) for name, reader in self.fields.items() if (located := reader.located(message))]
         default_ns = raw.publish_time_ns if self.source.time == PUBLISH_TIME else raw.log_time_ns
         for place, first, second, z in points:
-            values = {name: at_place(located, place) if located else None for name, located in found.items()}
+            values: dict[str, Any] = dict.fromkeys(_OTHERS)
+            for name, located in found:
+                values[name] = located[place] if place in located else at_place(located, place)
             if self._has_no_fix(values):
                 self.counts["no_fix"] += 1
                 continue
