@@ -32,7 +32,7 @@ app = typer.Typer(
       cadence COMMAND --help                options and examples of one command
 
     Exit codes: 0 ok, 1 defect, 2 wrong call, 3 unusable input, 4 configuration, 5 device or storage, 6 quality gate,
-    7 damaged input (doctor), 130 interrupted.
+    7 damaged input, 130 interrupted.
     """,
 )
 
@@ -49,7 +49,7 @@ RunOut = Annotated[str, typer.Option("--out", metavar="DIR", help="Folder for th
 Workers = Annotated[
     int | None, typer.Option(metavar="N", help="Processes; 0 works in this one; default: as cores and memory allow.")
 ]
-Engine = Annotated[Literal["local"], typer.Option(help="Where the work is done.")]
+Engine = Annotated[Literal["local", "ray"], typer.Option(help="Where the work is done: here, or on Ray (RAY_ADDRESS).")]
 Start = Annotated[str | None, typer.Option(metavar="T", help="Use nothing before T: extract.start.")]
 End = Annotated[str | None, typer.Option(metavar="T", help="Use nothing after T: extract.end.")]
 Topic = Annotated[list[str] | None, typer.Option(metavar="PATTERN", help="Use only such topics: extract.topics; repeatable.")]
@@ -125,7 +125,7 @@ def run(
 
     Ingest, extract, infer, export, report; finished stages are skipped. Folders are searched for logs, parts of a split
     recording are one mission. Each gets the mission directory DIR/<its name>; what became of all is in DIR/batch.json.
-    One bad log does not stop the others; the exit code is the highest of the failures.
+    One bad log does not stop the others; the exit code is the highest of the failures, or 7 where only damaged logs are amiss.
 
     \b
     Examples:

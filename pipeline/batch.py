@@ -13,7 +13,7 @@ from typing import Literal
 
 import torch
 
-from cadence.errors import CadenceError, DeviceError
+from cadence.errors import CadenceError, DeviceError, PartialInputError
 from pipeline.export import ExportConfig, export
 from pipeline.extract import ExtractConfig, extract
 from pipeline.infer import InferConfig, infer
@@ -24,6 +24,8 @@ from pipeline.missions import find_missions
 from pipeline.progress import Progress, Told
 from pipeline.report import ReportConfig, report
 from pipeline.storage import shown
+
+STAGES = ("ingest", "extract", "infer", "export", "report")
 
 Status = Literal["done", "skipped", "partial", "failed"]
 
@@ -121,15 +123,15 @@ def run_task(task: LogTask, progress: Progress) -> LogOutcome:
     try:
         # One thread: results depend on the number of threads, and must not depend on who else is running.
         with _threads(1), locked(Path(task.directory), progress.note):
-            for number, (_, stage) in enumerate(_STAGES):
-                finished.append(stage(task, progress.part(number / len(_STAGES), (number + 1) / len(_STAGES))))
+            for number, stage in enumerate(_RUNS):
+                finished.append(stage(task, progress.part(number / len(_RUNS), (number + 1) / len(_RUNS))))
     except CadenceError as error:
         message, code = _naming(task, str(error)), error.exit_code
     except MemoryError:
         message, code = f"{task.log}: out of memory; use fewer --workers", DeviceError.exit_code
     except Exception as error:  # a defect met by one log of a long batch must not cost the results of the others
         trace = traceback.format_exc()
-        stage_name = _STAGES[len(finished)][0] if len(finished) < len(_STAGES) else "run"
+        stage_name = STAGES[min(len(finished), len(STAGES) - 1)]
         message = f"{task.log}: defect in {stage_name} ({type(error).__name__}: {error}); please report its traceback"
         code = CadenceError.exit_code
     return LogOutcome(task, tuple(finished), " ".join(message.split()), code, time.monotonic() - started_s, trace)
@@ -149,8 +151,9 @@ def run_tasks(
 
 
 def exit_code(outcomes: Sequence[LogOutcome]) -> int:
-    """0 where every log went through, else the highest code of the failures."""
-    return max((outcome.exit_code for outcome in outcomes), default=0)
+    """0 where every log went through, else the highest code of the failures; without any, 7 where a log is damaged."""
+    is_partial = any(outcome.status == "partial" for outcome in outcomes)
+    return max((outcome.exit_code for outcome in outcomes), default=0) or PartialInputError.exit_code * is_partial
 
 
 def _naming(task: LogTask, message: str) -> str:
@@ -191,6 +194,4 @@ def _report(task: LogTask, progress: Progress) -> StageResult:
     return report(Path(task.directory), task.config.report, progress, task.force)
 
 
-_STAGES: tuple[tuple[str, Callable[[LogTask, Progress], StageResult]], ...] = (
-    ("ingest", _ingest), ("extract", _extract), ("infer", _infer), ("export", _export), ("report", _report),
-)  # fmt: skip
+_RUNS: tuple[Callable[[LogTask, Progress], StageResult], ...] = (_ingest, _extract, _infer, _export, _report)

@@ -3,6 +3,7 @@
 import glob
 import hashlib
 import itertools
+import json
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -49,8 +50,8 @@ def find_missions(logs: Sequence[str], out: str) -> tuple[Mission, ...]:
 def mission_directories(logs: Sequence[Path], out: Path) -> dict[Path, Path]:
     """The mission directory of every distinct log, in the order given: `out`/<stem of the log>.
 
-    Logs in different folders may share a stem: each of those gets its folder's hash as a suffix, the same whichever other
-    logs are given and in whichever order. A log that is given twice is run once.
+    Logs in different folders may share a stem: each of those gets its place's hash as a suffix, in whichever order they are
+    given. A log that is given twice is run once. What was run earlier stays where it is.
     """
     if not logs:
         raise UsageError("no log given; name at least one MCAP file")
@@ -113,11 +114,27 @@ def _place(part: str) -> Path:
 
 
 def _directories(groups: Sequence[tuple[str, ...]], out: str) -> list[str]:
-    """`out`/<name of the mission>; where several share the name, with a hash of where the first part lies."""
+    """`out`/<name of the mission>; with a hash of where the first part lies, where others share the name.
+
+    Others: among the missions given, or one that was run into that directory earlier and whose log still exists. The mission
+    whose results are there already keeps the plain name.
+    """
     names = [mission_name([_place(part) for part in group]) for group in groups]
     counts = Counter(names)
     found = []
     for name, group in zip(names, groups, strict=True):
-        suffix = "-" + hashlib.sha256(str(_place(group[0])).encode()).hexdigest()[:8] if counts[name] > 1 else ""
-        found.append(f"{out.rstrip('/') or '/'}/{name}{suffix}")
+        plain, place = f"{out.rstrip('/') or '/'}/{name}", _place(group[0])
+        holder = None if is_url(out) else _ingested_log(Path(plain))
+        is_shared = counts[name] > 1 or (holder is not None and holder.exists())
+        suffix = "-" + hashlib.sha256(str(place).encode()).hexdigest()[:8]
+        found.append(plain + suffix if is_shared and holder != place else plain)
     return found
+
+
+def _ingested_log(directory: Path) -> Path | None:
+    """The log whose results a mission directory holds; None where it holds none, or the log was fetched for it."""
+    try:
+        path = Path(json.loads((directory / "catalogue.json").read_text(encoding="utf-8"))["path"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    return path if path.is_absolute() else None

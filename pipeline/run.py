@@ -12,9 +12,13 @@ from pathlib import Path
 from types import FrameType
 from typing import Literal
 
+from tqdm import tqdm
+
 from cadence.errors import UsageError
-from pipeline.batch import Engine, LogOutcome, LogTask, RunConfig, exit_code, plan_tasks, run_tasks
+from pipeline.batch import STAGES, Engine, LogOutcome, LogTask, RunConfig, exit_code, plan_tasks, run_tasks
 from pipeline.engines.local import run_in_processes, run_in_sequence
+from pipeline.engines.ray import run_on_ray
+from pipeline.manifest import manifest_path
 from pipeline.progress import Progress, Told
 from pipeline.remote import run_anywhere, write_text
 from pipeline.summaries import batch_record, to_json
@@ -23,7 +27,7 @@ REPORT_NAME = "batch.json"
 _WORKER_BYTES = 2_000_000_000
 _MEMINFO = Path("/proc/meminfo")
 
-EngineName = Literal["local"]
+EngineName = Literal["local", "ray"]
 
 
 def run(
@@ -39,6 +43,8 @@ def run(
     out = out.removeprefix("file://").rstrip("/") or "/"
     tasks = plan_tasks(logs, out, config, force)
     chosen = choose_engine(engine, len(tasks), num_workers)
+    if len(tasks) > 1:
+        progress.note(_plan_line(tasks))
     with _interruptible(), contextlib.closing(_Shown(tasks, progress)) as shown:
         outcomes = run_tasks(tasks, chosen, shown.finished, shown.watch, run_anywhere)
     text = to_json(batch_record(outcomes, exit_code(outcomes), time.monotonic() - started_s)) + "\n"
@@ -49,17 +55,29 @@ def run(
 
 def selection_settings(start: str | None, end: str | None, topics: Sequence[str]) -> list[str]:
     """The flags that select a part of a log, as overrides of the settings of `extract`."""
-    values = {"start": start, "end": end, "topics": list(topics) or None}
-    return [f"extract.{name}={json.dumps(value)}" for name, value in values.items() if value is not None]
+    times = [f"extract.{name}={value}" for name, value in (("start", start), ("end", end)) if value is not None]
+    return times + ([f"extract.topics={json.dumps(list(topics))}"] if topics else [])
 
 
 def choose_engine(name: EngineName, num_tasks: int, num_workers: int | None) -> Engine:
-    """The engine, with as many workers as there are tasks, cores and room in memory for, unless `num_workers` says it."""
+    """The engine, with as many workers as there are tasks, cores and room in memory for, unless `num_workers` says it.
+
+    Ray counts the cores of its cluster.
+    """
     if num_workers is not None and num_workers < 0:
         raise UsageError(f"--workers {num_workers}: must not be negative")
+    if name == "ray":
+        return partial(run_on_ray, num_workers=num_workers or None)
     if num_workers is None:
         num_workers = 0 if num_tasks == 1 else max(1, min(len(os.sched_getaffinity(0)), _free_bytes() // _WORKER_BYTES))
     return partial(run_in_processes, num_workers=num_workers) if num_workers else run_in_sequence
+
+
+def _plan_line(tasks: Sequence[LogTask]) -> str:
+    """What is ahead. Whether it is really done is found out log by log, by what is in the files."""
+    size = tqdm.format_sizeof(sum(task.size_bytes for task in tasks), "B")
+    num_finished = sum(manifest_path(STAGES[-1], Path(task.directory)).is_file() for task in tasks)
+    return f"{len(tasks)} missions, {size}; {num_finished} were finished earlier, and are skipped where nothing has changed"
 
 
 class _Shown:

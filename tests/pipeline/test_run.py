@@ -8,6 +8,8 @@ import pytest
 import pipeline.batch as module
 from cadence.errors import DeviceError, InputError, UsageError
 from pipeline.batch import RunConfig, exit_code
+from pipeline.config import stage_config
+from pipeline.extract import ExtractConfig
 from pipeline.manifest import StageResult
 from pipeline.missions import mission_directories
 from pipeline.progress import Progress
@@ -23,15 +25,17 @@ def calls(monkeypatch):
 
     class Calls(list):
         failing: dict[tuple[str, str], BaseException]
+        summaries: dict[tuple[str, str], dict]
 
     record = Calls()
     record.failing = {}
+    record.summaries = {}
 
     def fake(stage, stem, config, force):
         record.append((stage, stem, config, force))
         if (stage, stem) in record.failing:
             raise record.failing[stage, stem]
-        return StageResult(stage, "done", (), {})
+        return StageResult(stage, "done", (), record.summaries.get((stage, stem), {}))
 
     monkeypatch.setattr(
         module, "ingest", lambda log, directory, config, progress, force: fake("ingest", log.stem, config, force)
@@ -90,7 +94,17 @@ def test_interruption_is_not_a_failure_of_a_log(calls, tmp_path):
 def test_progress_tells_which_log_is_finished(calls, tmp_path, capsys):
     run_here("ab", tmp_path, Progress())
     captured = capsys.readouterr()
-    assert "[2/2] b: done" in captured.err and captured.out == ""
+    assert (
+        "2 missions, 0.00B; 0 were finished earlier" in captured.err and "[2/2] b: done" in captured.err and captured.out == ""
+    )
+
+
+def test_results_from_a_damaged_log_have_a_code_of_their_own_below_that_of_failures(calls, tmp_path):
+    calls.summaries = {("ingest", "b"): {"is_complete": False}}
+    outcomes = run_here("ab", tmp_path)
+    assert [outcome.status for outcome in outcomes] == ["done", "partial"] and exit_code(outcomes) == 7
+    calls.failing = {("infer", "a"): InputError("a.mcap: no")}
+    assert exit_code(run_here("ab", tmp_path)) == 3
 
 
 def test_no_log_is_a_wrong_call(tmp_path):
@@ -116,9 +130,10 @@ def test_a_number_of_workers_that_cannot_be(tmp_path):
 
 def test_flags_that_select_are_settings_of_extract():
     assert selection_settings(None, None, ()) == []
-    assert selection_settings("10:00", "1 h", ["/a", "/b*"]) == [
-        'extract.start="10:00"', 'extract.end="1 h"', 'extract.topics=["/a", "/b*"]',
-    ]  # fmt: skip
+    flags = selection_settings("10", "2024-05-01T12:30:00Z", ["/a", "/b*"])
+    assert stage_config(RunConfig, None, None, flags).extract == ExtractConfig(
+        start=10.0, end="2024-05-01T12:30:00Z", topics=("/a", "/b*")
+    )
 
 
 def test_directories_of_logs_that_share_a_stem_differ_and_do_not_depend_on_the_order():
@@ -128,6 +143,21 @@ def test_directories_of_logs_that_share_a_stem_differ_and_do_not_depend_on_the_o
     assert there[logs[2]] == Path("out/other")
     assert len(set(there.values())) == 3
     assert all(there[log].name.startswith("flight-") for log in logs[:2])
+
+
+def test_a_log_of_the_same_name_from_another_folder_does_not_replace_earlier_results(tmp_path):
+    one, two = tmp_path / "one" / "flight.mcap", tmp_path / "two" / "flight.mcap"
+    out = tmp_path / "out"
+    for log in (one, two):
+        log.parent.mkdir()
+        log.touch()
+    (out / "flight").mkdir(parents=True)
+    (out / "flight" / "catalogue.json").write_text(json.dumps({"path": str(one)}))
+    assert mission_directories([one], out) == {one: out / "flight"}
+    other = mission_directories([two], out)[two]
+    assert other.name.startswith("flight-") and mission_directories([one, two], out) == {one: out / "flight", two: other}
+    one.unlink()  # moved: the results may be of use
+    assert mission_directories([two], out) == {two: out / "flight"}
 
 
 def test_a_log_given_twice_is_run_once(tmp_path):
