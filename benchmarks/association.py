@@ -65,7 +65,7 @@ class Log:
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """Tracks [A', T, 2] on the log's grid, NaN where one does not exist; labels [N], P(detection -> agent), if there are any."""
+    """Tracks [A', T, 2] on the grid, NaN where one does not exist; labels [N] and P(detection -> agent), if there are any."""
 
     position_m: Floats
     label: Integers | None = None
@@ -383,7 +383,7 @@ class Case:
 
 def rendezvous_case(number: int) -> Case:
     """Held-out episodes; settings are searched on two others."""
-    options = [Settings(q, gate, 1e-10, 1e9) for q in (3e-3, 1e-2, 3e-2, 1e-1) for gate in (4.0, 8.0)]
+    options = [Settings(q, gate, 1e-10, 1e9) for q in (3e-3, 1e-2, 1e-1) for gate in (4.0, 8.0)]
     return Case("rendezvous", rendezvous_logs(HELD_OUT_SEED, number), rendezvous_logs(TUNING_SEED, 2), tuple(options))
 
 

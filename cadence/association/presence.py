@@ -48,26 +48,28 @@ class Habits:
     max_speed_mps: float | None
 
 
-def own_rate_hz(tracks: Tracks, habits: Habits) -> Floats:
-    """Expected rate of every agent's detections [P, A], as of its last one."""
+def log_silence(tracks: Tracks, habits: Habits, time_s: float) -> tuple[Floats, Floats]:
+    """For every agent [P, A]: log probability of no detection from its last one to `time_s`, and log density of one just then.
+
+    An agent that stays is silent with probability (1 + silent / watched) ^ -count (a Poisson process whose rate has a gamma law);
+    one that leaves is silent from then on. The two are joined as for a Poisson process of the same silence.
+    """
+    silent_s = np.maximum(time_s - tracks.last_s, 0.0)
     watched_s = _PRIOR_COUNT / habits.rate_hz + tracks.last_s - tracks.first_s
-    return np.asarray((_PRIOR_COUNT + np.maximum(tracks.count - 1, 0)) / watched_s)
-
-
-def log_silence(rate_hz: Floats, leave_hz: float, silent_s: Floats) -> Floats:
-    """Log probability that an agent is not detected for so long after a detection: it left, or it stayed unseen."""
-    total = rate_hz + leave_hz
-    return np.asarray(np.log(leave_hz + rate_hz * np.exp(-total * silent_s)) - np.log(total))
+    count = _PRIOR_COUNT + np.maximum(tracks.count - 1, 0)
+    unseen = count * np.log1p(silent_s / watched_s)
+    left = habits.leave_hz * silent_s
+    total = unseen + left
+    with np.errstate(divide="ignore", invalid="ignore"):
+        silence = np.logaddexp(np.log(left), np.log(unseen) - total) - np.log(total)
+    return np.where(total > 0, silence, 0.0), np.log(count / (watched_s + silent_s)) - total
 
 
 def log_silence_between(tracks: Tracks, habits: Habits, begin_s: float, end_s: float) -> Floats:
     """Log probability that nobody was detected from `begin_s` to `end_s`, given the detections up to `begin_s` [P]."""
     is_met = np.arange(tracks.last_s.shape[1]) < tracks.num_agents[:, None]
-    rate = own_rate_hz(tracks, habits)
-    silence = log_silence(rate, habits.leave_hz, end_s - tracks.last_s) - log_silence(
-        rate, habits.leave_hz, np.maximum(begin_s - tracks.last_s, 0.0)
-    )
-    return np.where(is_met, silence, 0.0).sum(1) - _new_hz(tracks, habits) * (end_s - begin_s)
+    silence = log_silence(tracks, habits, end_s)[0] - log_silence(tracks, habits, begin_s)[0]
+    return np.asarray(np.where(is_met, silence, 0.0).sum(1) - _new_hz(tracks, habits) * (end_s - begin_s))
 
 
 def log_hazards(tracks: Tracks, habits: Habits, time_s: float) -> Floats:
@@ -76,12 +78,10 @@ def log_hazards(tracks: Tracks, habits: Habits, time_s: float) -> Floats:
     An agent that was detected at this very moment is not detected twice.
     """
     num_particles, num_slots = tracks.last_s.shape
-    rate = own_rate_hz(tracks, habits)
-    silent_s = time_s - tracks.last_s
-    stayed = np.log(rate) - (rate + habits.leave_hz) * silent_s - log_silence(rate, habits.leave_hz, silent_s)
-    slots = np.arange(num_slots)
+    silence, again = log_silence(tracks, habits, time_s)
+    is_possible = (np.arange(num_slots) < tracks.num_agents[:, None]) & (tracks.last_s < time_s)
     hazards = np.empty((num_particles, num_slots + 2))
-    hazards[:, :-2] = np.where((slots < tracks.num_agents[:, None]) & (silent_s > 0), stayed, -np.inf)
+    hazards[:, :-2] = np.where(is_possible, again - silence, -np.inf)
     with np.errstate(divide="ignore"):
         hazards[:, -2] = np.log(_new_hz(tracks, habits))
         hazards[:, -1] = np.log(habits.clutter_hz)
@@ -91,5 +91,5 @@ def log_hazards(tracks: Tracks, habits: Habits, time_s: float) -> Floats:
 def _new_hz(tracks: Tracks, habits: Habits) -> Floats:
     """Rate at which an agent is met for the first time [P]."""
     if habits.num_agents is None:
-        return np.where(tracks.num_agents < habits.max_agents, habits.arrive_hz, 0.0)
-    return (habits.num_agents - tracks.num_agents) * habits.rate_hz
+        return np.asarray(np.where(tracks.num_agents < habits.max_agents, habits.arrive_hz, 0.0), dtype=np.float64)
+    return np.asarray((habits.num_agents - tracks.num_agents) * habits.rate_hz)

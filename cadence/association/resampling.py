@@ -49,4 +49,4 @@ def _stratified(weight: Floats, num: int, uniform: float) -> NDArray[np.int64]:
     edges = np.cumsum(weight)
     points = (np.arange(num) + uniform) / num * edges[-1]
     index = np.unique(np.searchsorted(edges, points, side="right"))
-    return np.minimum(index, len(weight) - 1).astype(np.int64)
+    return np.asarray(np.minimum(index, len(weight) - 1), dtype=np.int64)
