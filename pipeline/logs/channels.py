@@ -1,7 +1,9 @@
 """Channels and messages of a log, not decoded: one by one, or as columns."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
+from itertools import repeat
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -23,15 +25,17 @@ class Channel:
     metadata: Mapping[str, str] = field(repr=False)
 
 
-@dataclass(frozen=True)
-class RawMessage:
-    """One message, not decoded. Times are nanoseconds since the epoch that the recorder chose, normally 1970."""
+class RawMessage(NamedTuple):
+    """One message, not decoded. Times are nanoseconds since the epoch that the recorder chose, normally 1970.
+
+    A tuple and not a dataclass: a log has hundreds of thousands, and tuples are made in half the time.
+    """
 
     channel: Channel
     log_time_ns: int
     publish_time_ns: int
     sequence: int
-    data: bytes = field(repr=False)
+    data: bytes
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,8 +54,8 @@ class Batch:
     end: npt.NDArray[np.int64]
 
     def __post_init__(self) -> None:
-        columns = (self.log_time_ns, self.publish_time_ns, self.sequence, self.begin, self.end)
-        if len({column.shape for column in columns}) != 1 or self.begin.ndim != 1:
+        columns = (self.log_time_ns, self.publish_time_ns, self.sequence, self.end)
+        if self.begin.ndim != 1 or any(column.shape != self.begin.shape for column in columns):
             raise ValueError("the columns of a batch must have one length")
 
     def __len__(self) -> int:
@@ -64,19 +68,29 @@ class Batch:
     def messages(self) -> Iterator[RawMessage]:
         """Each message by itself."""
         columns = (self.log_time_ns.tolist(), self.publish_time_ns.tolist(), self.sequence.tolist(), self.payloads())
-        return (RawMessage(self.channel, *values) for values in zip(*columns, strict=True))
+        return _made(repeat(self.channel, len(self)), *columns)
 
 
 def raw_messages(channels: Mapping[int, Channel], data: bytes, rows: Rows) -> Iterator[RawMessage]:
     """The messages of `rows`, in their order; `data` are the bytes of their block, `channels` theirs by id."""
-    columns = (rows.channel_id, rows.log_time_ns, rows.publish_time_ns, rows.sequence, rows.begin, rows.end)
-    for number, log_time, publish_time, sequence, begin, end in zip(*(column.tolist() for column in columns), strict=True):
-        yield RawMessage(channels[number], log_time, publish_time, sequence, data[begin:end])
+    named = [channels[number] for number in rows.channel_id.tolist()]
+    times = (rows.log_time_ns.tolist(), rows.publish_time_ns.tolist())
+    payloads = [data[begin:end] for begin, end in zip(rows.begin.tolist(), rows.end.tolist(), strict=True)]
+    return _made(named, *times, rows.sequence.tolist(), payloads)
+
+
+def _made(*columns: Iterable[Any]) -> Iterator[RawMessage]:
+    """Messages from their columns, without a step of the interpreter for each."""
+    return map(tuple.__new__, repeat(RawMessage), zip(*columns, strict=True))
 
 
 def batches_of(channels: Mapping[int, Channel], data: bytes, rows: Rows) -> Iterator[Batch]:
     """The messages of `rows` by channel, in the order of the channels' ids."""
-    for number in np.unique(rows.channel_id).tolist():
-        own = rows[rows.channel_id == number]
-        times = own.log_time_ns.astype(np.int64)
-        yield Batch(channels[number], times, own.publish_time_ns, own.sequence, data, own.begin, own.end)
+    rows = rows[np.argsort(rows.channel_id, kind="stable")]
+    times = rows.log_time_ns.astype(np.int64)
+    ends = [*(np.flatnonzero(np.diff(rows.channel_id)) + 1).tolist(), len(rows)]
+    for begin, end in zip([0, *ends], ends, strict=False):
+        if end > begin:
+            own = slice(begin, end)
+            columns = (times[own], rows.publish_time_ns[own], rows.sequence[own], data, rows.begin[own], rows.end[own])
+            yield Batch(channels[int(rows.channel_id[begin])], *columns)

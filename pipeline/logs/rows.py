@@ -4,7 +4,7 @@ An index is believed only where it accounts for every byte: its messages must be
 times, and between them there may be no other message. Then no record has to be walked one by one.
 """
 
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from dataclasses import dataclass, fields
 from typing import Any, Final, Self
 
@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from mcap.opcode import Opcode
 
-from pipeline.logs.records import HEAD, MAX_TIME_NS, MESSAGE_HEAD, DamagedRecord, walk
+from pipeline.logs.records import HEAD, INDEX_ENTRY, MAX_TIME_NS, MESSAGE_HEAD, DamagedRecord, walk
 
 Index = Sequence[tuple[int, npt.NDArray[np.void]]]
 """Channel ids and entries, as `parse_message_index` gives them."""
@@ -28,6 +28,7 @@ _MESSAGE: Final = np.dtype(
         ("publish_time", "<u8"),
     ]
 )
+_INDEX_HEAD_BYTES: Final = 6  # channel id and length of the entries
 assert _MESSAGE.itemsize == HEAD.size + MESSAGE_HEAD.size
 
 
@@ -46,7 +47,8 @@ class Rows:
     end: npt.NDArray[np.int64]
 
     def __post_init__(self) -> None:
-        if len({getattr(self, item.name).shape for item in fields(self)}) != 1 or self.begin.ndim != 1:
+        columns = (self.channel_id, self.sequence, self.log_time_ns, self.publish_time_ns, self.end)
+        if self.begin.ndim != 1 or any(column.shape != self.begin.shape for column in columns):
             raise ValueError("the columns of rows must have one length")
 
     def __len__(self) -> int:
@@ -54,7 +56,10 @@ class Rows:
 
     def __getitem__(self, rows: Any) -> Self:
         """The rows of a mask, of indices or of a slice."""
-        return type(self)(*(getattr(self, item.name)[rows] for item in fields(self)))
+        return type(self)(
+            self.channel_id[rows], self.sequence[rows], self.log_time_ns[rows], self.publish_time_ns[rows],
+            self.begin[rows], self.end[rows],
+        )  # fmt: skip
 
     @classmethod
     def concatenate(cls, parts: Sequence["Rows"]) -> "Rows":
@@ -81,8 +86,8 @@ def rows_by_walk(data: bytes, is_cut: bool = False) -> tuple[Rows, Definitions]:
 
 def rows_by_index(data: bytes, index: Index) -> tuple[Rows, Definitions] | None:
     """The same as `rows_by_walk`, by the message indexes of the chunk; None where they do not agree with its content."""
-    offsets = np.concatenate([entries["offset"] for _, entries in index])
-    if (offsets > np.uint64(max(0, len(data) - _MESSAGE.itemsize))).any() or len(data) < _MESSAGE.itemsize:
+    offsets = np.concatenate([np.empty(0, np.uint64), *(entries["offset"] for _, entries in index)])
+    if not len(offsets) or (offsets > np.uint64(max(0, len(data) - _MESSAGE.itemsize))).any() or len(data) < _MESSAGE.itemsize:
         return None
     order = np.argsort(offsets, kind="stable")
     begin = offsets[order].astype(np.int64)
@@ -98,13 +103,18 @@ def rows_by_index(data: bytes, index: Index) -> tuple[Rows, Definitions] | None:
     return None if definitions is None else (_rows_of(heads, begin, end), definitions)
 
 
-def indexed_rows(data: bytes, index: Index) -> Rows:
-    """The messages of those indexes that are given, of a chunk whose indexes have been found to agree with it."""
-    offsets = np.sort(np.concatenate([entries["offset"] for _, entries in index]).astype(np.int64))
+def indexed_rows(data: bytes, index: bytes, channel_ids: Set[int]) -> Rows:
+    """The messages of some channels in a chunk, by the bytes of its message indexes, which were found to agree with it."""
+    named = [
+        index[begin + _INDEX_HEAD_BYTES : end]
+        for _, begin, end in walk(index)
+        if int.from_bytes(index[begin : begin + 2], "little") in channel_ids
+    ]
+    offsets = np.sort(np.frombuffer(b"".join(named), INDEX_ENTRY)["offset"].astype(np.int64))
     if len(offsets) and not 0 <= offsets[0] <= offsets[-1] <= len(data) - _MESSAGE.itemsize:
         raise DamagedRecord("a message index points outside its chunk")
     rows = _rows(data, offsets)
-    if (rows.end > len(data)).any() or not np.isin(rows.channel_id, [number for number, _ in index]).all():
+    if not ((rows.end <= len(data)) & (rows.end >= rows.begin)).all() or not channel_ids >= set(rows.channel_id.tolist()):
         raise DamagedRecord("a message index differs from its chunk")
     return rows
 

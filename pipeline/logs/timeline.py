@@ -6,8 +6,10 @@ arrays of places. Where many blocks overlap, their bytes are not all held but re
 
 import contextlib
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import BinaryIO, Final, Literal
 
@@ -21,10 +23,8 @@ from pipeline.logs.records import (
     MAX_TIME_NS,
     DamagedRecord,
     parse_chunk,
-    parse_message_index,
     unpack_chunk,
     unpack_cut_chunk,
-    walk,
 )
 from pipeline.logs.rows import Rows, indexed_rows, rows_by_walk
 
@@ -81,13 +81,15 @@ class Timeline:
 
     def messages(self) -> Iterator[RawMessage]:
         """All messages by log time; those of one time in the order of the sources and of the file."""
+        return chain.from_iterable(self._stretches())
+
+    def _stretches(self) -> Iterator[Iterable[RawMessage]]:
         waiting: list[_Piece] = []
         bounds = [*(place[:3] for place in self.places[1:]), (math.inf, 0, 0)]
-        for (_, number, offset, block), bound in zip(self.places, bounds, strict=False):
-            if self._is_wanted(number, block):
-                data, rows = self._load(number, block)
-                self._hold((number, offset), data)
-                waiting.append(_Piece((number, offset), block, rows))
+        for (number, block, loaded), bound in zip(self._blocks(), bounds, strict=False):
+            if loaded is not None:
+                self._hold((number, block.offset), loaded[0])
+                waiting.append(_Piece((number, block.offset), block, loaded[1]))
             if waiting:
                 pairs = [piece.split(bound) for piece in waiting]
                 yield from self._in_order([ready for ready, _ in pairs if len(ready.rows)])
@@ -98,12 +100,26 @@ class Timeline:
 
     def batches(self) -> Iterator[Batch]:
         """The messages of each block and channel at a time, the blocks by their first log time."""
-        for _, number, _, block in self.places:
-            if self._is_wanted(number, block):
-                data, rows = self._load(number, block)
-                yield from batches_of(self.sources[number].channels, data, rows)
+        for number, block, loaded in self._blocks():
+            if loaded is not None:
+                yield from batches_of(self.sources[number].channels, *loaded)
             self._advance(block)
         self._finish()
+
+    def _blocks(self) -> Iterator[tuple[int, Block, tuple[bytes, Rows] | None]]:
+        """Number of the source, block, and what `_load` gives where anything in it is wanted.
+
+        The next block is read meanwhile in a thread: reading, unpacking and checksums let Python go on.
+        """
+        coming: tuple[int, Block, Future[tuple[bytes, Rows]] | None] | None = None
+        with ThreadPoolExecutor(max_workers=1) as ahead:
+            for _, number, _, block in self.places:
+                future = ahead.submit(self._load, number, block) if self._is_wanted(number, block) else None
+                if coming is not None:
+                    yield *coming[:2], coming[2] and coming[2].result()
+                coming = number, block, future
+            if coming is not None:
+                yield *coming[:2], coming[2] and coming[2].result()
 
     def _is_wanted(self, number: int, block: Block) -> bool:
         is_in_time = block.start_ns < self.selection.end_ns and block.end_ns >= self.selection.start_ns
@@ -124,10 +140,9 @@ class Timeline:
         with reading(part.path) as file:
             data = _unpacked(file, block)
             index = b"" if block.index_length == 0 else read_span(file, block.offset + block.length, block.index_length)
-            rows = _indexed(data, index, wanted) if index else rows_by_walk(data, block.kind == "cut")[0].usable()
-        mask = np.isin(rows.channel_id, list(wanted))
-        mask &= (rows.log_time_ns >= self.selection.start_ns) & (rows.log_time_ns < np.uint64(self.selection.end_ns))
-        return data, (rows if mask.all() else rows[mask]).by_time()
+            rows = indexed_rows(data, index, wanted.keys()) if index else _walked(data, block, wanted)
+        is_in_time = (rows.log_time_ns >= self.selection.start_ns) & (rows.log_time_ns < np.uint64(self.selection.end_ns))
+        return data, (rows if is_in_time.all() else rows[is_in_time]).by_time()
 
     def _hold(self, key: tuple[int, int], data: bytes) -> None:
         """Keep the bytes of a block for a while, and forget those that have not been used for the longest time."""
@@ -147,10 +162,10 @@ class Timeline:
         self._hold(piece.key, data)
         return data
 
-    def _in_order(self, pieces: list[_Piece]) -> Iterator[RawMessage]:
-        """The messages of all `pieces` by time, then by place."""
+    def _in_order(self, pieces: list[_Piece]) -> Iterator[Iterable[RawMessage]]:
+        """The messages of all `pieces` by time, then by place, in stretches."""
         if len(pieces) == 1:
-            yield from raw_messages(self.sources[pieces[0].key[0]].channels, self._bytes(pieces[0]), pieces[0].rows)
+            yield raw_messages(self.sources[pieces[0].key[0]].channels, self._bytes(pieces[0]), pieces[0].rows)
             return
         if not pieces:
             return
@@ -161,7 +176,7 @@ class Timeline:
         filled = np.cumsum((rows.end - rows.begin)[order])
         cuts = np.flatnonzero(np.diff(filled // MAX_HELD_BYTES)) + 1
         for stretch in np.split(order, cuts):
-            yield from self._stretch(pieces, rows, owner, stretch)
+            yield self._stretch(pieces, rows, owner, stretch)
 
     def _stretch(
         self, pieces: list[_Piece], rows: Rows, owner: npt.NDArray[np.int64], stretch: npt.NDArray[np.int64]
@@ -209,10 +224,7 @@ def _unpacked(file: BinaryIO, block: Block) -> bytes:
     return unpack_cut_chunk(data)[1] if block.kind == "cut" else data
 
 
-def _indexed(data: bytes, index: bytes, wanted: Mapping[int, Channel]) -> Rows:
-    """The messages of the wanted channels by the message indexes behind the chunk."""
-    found = []
-    for _, begin, end in walk(index):
-        if int.from_bytes(index[begin : begin + 2], "little") in wanted:
-            found.append(parse_message_index(index[begin:end]))
-    return indexed_rows(data, found).usable() if found else rows_by_walk(b"")[0]
+def _walked(data: bytes, block: Block, wanted: Mapping[int, Channel]) -> Rows:
+    """The messages of the wanted channels by a walk over the records."""
+    rows = rows_by_walk(data, block.kind == "cut")[0]
+    return rows[np.isin(rows.channel_id, list(wanted))]
