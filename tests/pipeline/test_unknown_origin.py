@@ -9,8 +9,10 @@ import pyarrow as pa
 import pytest
 import torch
 from mission_fixture import build_mission
+from test_forecasts import checkpoint
 
 from cadence.association.types import AssociationConfig, Associations
+from cadence.diffusion.absolute import AbsoluteSampling
 from cadence.errors import InputError
 from cadence.types import HypothesisSet, WindowBatch
 from pipeline import association
@@ -264,3 +266,23 @@ def test_side_file_and_page_tell_of_agents_and_sources(tmp_path: Path, monkeypat
     report(directory, ReportConfig(), QUIET)
     page = (directory / "report.html").read_text()
     assert "Agents of unknown origin" in page and f"{int((true == 0).sum())} of {len(true)}" in page
+
+
+def slow(table: pa.Table) -> pa.Table:
+    """The same with a minute for every second: the paper's and the scene preset's steps are minutes."""
+    time_ns = (table["time_ns"].to_numpy() - START_NS) * 60 + START_NS
+    return table.set_column(table.schema.get_field_index("time_ns"), table.schema.field("time_ns"), pa.array(time_ns))
+
+
+@pytest.mark.usefixtures("stand_in")
+@pytest.mark.parametrize("preset", ["paper", "scene"])
+def test_presets_that_know_a_place_draw_every_way(tmp_path: Path, preset: str) -> None:
+    directory = mission(tmp_path, slow(detections()))
+    weights = "prison" if preset == "scene" else str(checkpoint(tmp_path / "small.safetensors"))
+    few = AbsoluteSampling(sampler="dpmpp", num_steps=2)
+    config = InferConfig(num_hypotheses=8, checkpoint=weights, device="cpu", paper=few, grid=GridConfig(stride_steps=32))
+    result = infer(directory, config, QUIET)
+    assert result.summary["preset"] == preset and result.summary["association"]["num_agents"] == 2
+    for window in read_hypothesis_tables(directory).windows:
+        assert window.weight.sum() == pytest.approx(1.0) and [agent.agent_id for agent in window.agents] == ["a0", "a1"]
+        assert all(len(agent.position_m) == 8 and np.isfinite(agent.position_m).all() for agent in window.agents)
