@@ -26,9 +26,9 @@ def associate(
 ) -> list[Associations]:
     """What the detections up to each origin may have come from.
 
-    Later detections revise what is said of earlier ones, never the other way round: but for `habits`, which belong to the log as
-    a whole as the fitted bank does, nothing after an origin influences its associations. An agent keeps its number from origin to
-    origin as long as it keeps most of its detections.
+    Later detections revise what is said of earlier ones, never the other way round: but for `habits`, which belong to the
+    log as a whole as the fitted bank does, nothing after an origin influences its associations. An agent keeps its number from
+    origin to origin as long as it keeps most of its detections.
 
     Args:
         time_s: [N] in any order, seconds from any zero.

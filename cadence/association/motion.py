@@ -1,7 +1,7 @@
 """How agents move between detections: a few integrated Ornstein-Uhlenbeck models, of which each agent follows one for a while.
 
-With velocity v and position p of one axis, dv = -v / relaxation dt + noise that keeps the standard deviation of v at `speed`, and
-dp = v dt; all integrals in closed form (Särkkä and Solin, "Applied Stochastic Differential Equations", 2019, ch. 6).
+With velocity v and position p of one axis, dv = -v / relaxation dt + noise that keeps the standard deviation of v at `speed`,
+and dp = v dt; all integrals in closed form (Särkkä and Solin, "Applied Stochastic Differential Equations", 2019, ch. 6).
 """
 
 from dataclasses import dataclass

@@ -1,7 +1,7 @@
 """Names of agents that hold over all ways to read a log and over all window origins.
 
-Every way numbers its agents as it meets them. Here they get the names of the agents of a way that was named before, matched by the
-detections that both give to them (the assignment of greatest overlap).
+Every way numbers its agents as it meets them. Here they get the names of the agents of a way that was named before, matched
+by the detections that both give to them (the assignment of greatest overlap).
 """
 
 import numpy as np

@@ -1,8 +1,8 @@
 """The filter: many ways to read a stream side by side, each with its agents' Kalman filters.
 
-Rao-Blackwellised particle data association (Särkkä, Vehtari, Lampinen, "Rao-Blackwellized particle filter for multiple target tracking",
-2007). Every way is continued by every agent that may have caused the next detection, and of all continuations the best are kept and the
-others drawn from (`resampling`), which is the optimal importance distribution without its noise.
+Rao-Blackwellised particle data association (Särkkä, Vehtari, Lampinen, "Rao-Blackwellized particle filter for multiple target
+tracking", 2007). Every way is continued by every agent that may have caused the next detection, and of all continuations the
+best are kept and the others drawn from (`resampling`), which is the optimal importance distribution without its noise.
 """
 
 from collections.abc import Iterator

@@ -1,7 +1,7 @@
 """How often agents are detected, come and go: what is expected of the next detection before its position is looked at.
 
-An agent is detected at a rate of its own (a gamma law around the stream's rate, learned from its detections) until it leaves, after an
-exponential time. Neither is sampled: the chance that a silent agent has left is part of how unlikely its next detection is.
+An agent is detected at a rate of its own (a gamma law around the stream's rate, learned from its detections) until it leaves,
+after an exponential time. Neither is sampled: that a silent agent may have left is part of how unlikely its next detection is.
 """
 
 from dataclasses import dataclass
@@ -51,8 +51,8 @@ class Habits:
 def log_silence(tracks: Tracks, habits: Habits, time_s: float) -> tuple[Floats, Floats]:
     """For every agent [P, A]: log probability of no detection from its last one to `time_s`, and log density of one just then.
 
-    An agent that stays is silent with probability (1 + silent / watched) ^ -count (a Poisson process whose rate has a gamma law);
-    one that leaves is silent from then on. The two are joined as for a Poisson process of the same silence.
+    An agent that stays is silent with probability (1 + silent / watched) ^ -count (a Poisson process whose rate has a gamma
+    law); one that leaves is silent from then on. The two are joined as for a Poisson process of the same silence.
     """
     silent_s = np.maximum(time_s - tracks.last_s, 0.0)
     watched_s = _PRIOR_COUNT / habits.rate_hz + tracks.last_s - tracks.first_s

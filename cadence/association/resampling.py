@@ -1,8 +1,8 @@
 """Fewer ways out of many, without bias.
 
-Optimal resampling for discrete states (Fearnhead and Clifford, "On-line inference for hidden Markov models via particle filters",
-2003): what weighs enough is kept as it is, the rest is drawn by stratified sampling and shares one weight. No way is kept twice, and
-each weight is right in expectation.
+Optimal resampling for discrete states (Fearnhead and Clifford, "On-line inference for hidden Markov models via particle
+filters", 2003): what weighs enough is kept as it is, the rest is drawn by stratified sampling and shares one weight. No way is
+kept twice, and each weight is right in expectation.
 """
 
 import numpy as np
@@ -36,7 +36,7 @@ def resample(weight: Floats, num: int, uniform: float) -> tuple[NDArray[np.int64
 
 
 def threshold(weight: Floats, num: int) -> float:
-    """The weight c with sum(min(weight / c, 1)) = num: heavier candidates are kept, lighter ones drawn with probability w / c."""
+    """The weight c with sum(min(weight / c, 1)) = num: heavier candidates are kept, lighter ones drawn with chance w / c."""
     ordered = np.sort(weight)
     num_light = np.arange(len(weight) - num + 1, len(weight) + 1)
     level = np.cumsum(ordered)[num_light - 1] / (num - (len(weight) - num_light))

@@ -1,0 +1,161 @@
+"""The filter against what can be computed without it: all ways to read a short stream, and the bank's Kalman filter."""
+
+import itertools
+
+import numpy as np
+import pytest
+import torch
+
+from cadence.association.motion import Modes, motion
+from cadence.association.particles import Stream, continuations, follow
+from cadence.association.presence import Habits, log_silence
+from cadence.association.resampling import resample, threshold
+from cadence.association.tracks import Detection, Tracks, log_densities, updated
+from cadence.association.types import CLUTTER
+from cadence.bank.components import ornstein_uhlenbeck, transition
+
+ONE = Modes(np.array([40.0]), np.array([2.0]), np.ones(1), 0.0)
+TWO = Modes(np.array([20.0, 300.0]), np.array([0.5, 3.0]), np.array([0.4, 0.6]), 0.2)
+
+
+def habits(num_agents=2, leave_hz=0.0, modes=TWO, temper=1.0):
+    return Habits(modes, 0.02, leave_hz, 0.01, 0.001, 1e6, temper, 0.0, num_agents, 9, None)
+
+
+def stream(num, seed=0):
+    rng = np.random.default_rng(seed)
+    covariance = np.broadcast_to(25.0 * np.eye(2), (num, 2, 2)).copy()
+    return Stream(np.cumsum(rng.uniform(5.0, 40.0, num)), rng.normal(0.0, 60.0, (num, 2)), covariance)
+
+
+def forced(label, seen, about):
+    """Log density of one labelling, agents numbered as they are met."""
+    tracks, total, before = Tracks.none(len(about.modes)), 0.0, seen.time_s[0]
+    for agent, time_s, place, covariance in zip(label, seen.time_s, seen.position_m, seen.covariance_m2, strict=True):
+        detection = Detection(time_s, place, covariance)
+        column = -1 if agent == CLUTTER else -2 if agent == tracks.num_agents[0] else agent
+        total += continuations(tracks, about, detection, before)[0, column]
+        tracks, before = updated(tracks, about.modes, detection, np.array([agent])), time_s
+    return total
+
+
+def labellings(num, most):
+    for label in itertools.product(range(-1, most), repeat=num):
+        met = 0
+        for agent in label:
+            if agent > met:
+                break
+            met = max(met, agent + 1)
+        else:
+            yield label
+
+
+@pytest.mark.parametrize(("num_agents", "leave_hz"), [(2, 0.0), (None, 0.002)])
+def test_enough_particles_are_the_exact_law_of_all_labellings(num_agents, leave_hz):
+    seen, about = stream(5), habits(num_agents, leave_hz)
+    ways = list(labellings(5, num_agents or 5))
+    exact = np.array([forced(way, seen, about) for way in ways])
+    *_, last = follow(seen, about, 10_000, seed=0)
+    law = dict(zip(ways, np.exp(exact - np.logaddexp.reduce(exact)), strict=True))
+    np.testing.assert_allclose(last.log_evidence, np.logaddexp.reduce(exact), atol=1e-4)
+    for label, weight in zip(last.label, last.weight, strict=True):
+        np.testing.assert_allclose(weight, law[tuple(label.tolist())], atol=1e-4)
+
+
+def test_few_particles_are_right_on_average():
+    seen, about = stream(6), habits()
+    *_, exact = follow(seen, about, 10_000, seed=0)
+    wanted = exact.weight @ (exact.label == 0)
+    found = []
+    for seed in range(300):
+        *_, last = follow(seen, about, 6, seed)
+        assert len(last.weight) <= 6
+        found.append(np.exp(last.log_evidence - exact.log_evidence) * (last.weight @ (last.label == 0)))
+    error = np.std(found, axis=0) / np.sqrt(len(found))
+    assert (np.abs(np.mean(found, axis=0) - wanted) < 4.5 * error + 1e-3).all()
+
+
+def test_motion_is_the_banks_ornstein_uhlenbeck():
+    duration = np.array([1e-3, 0.5, 3.0, 4.1, 80.0, 4000.0])
+    way = motion(ONE, duration)
+    matrix, noise = transition(
+        ornstein_uhlenbeck([40.0], [2.0], [0.0])[torch.zeros(6, dtype=torch.int64)], torch.tensor(duration)
+    )
+    for found, wanted in (
+        (way.gain, matrix[:, 0, 2]),
+        (way.decay, matrix[:, 2, 2]),
+        (way.noise_pp, noise[:, 0, 0]),
+        (way.noise_pv, noise[:, 0, 2]),
+        (way.noise_vv, noise[:, 2, 2]),
+    ):
+        np.testing.assert_allclose(found[:, 0], wanted.numpy(), rtol=1e-8)
+
+
+def test_densities_of_one_track_are_those_of_a_joint_gaussian():
+    """Three detections of one agent in one mode: the filter's product is the density of the joint Gaussian of all positions."""
+    seen = stream(3)
+    tracks, total = Tracks.none(1), 0.0
+    for index, time_s in enumerate(seen.time_s):
+        detection = Detection(time_s, seen.position_m[index], seen.covariance_m2[index])
+        if index:
+            total += log_densities(tracks, ONE, detection)[0, 0]
+        tracks = updated(tracks, ONE, detection, np.array([0]))
+    gap = np.diff(seen.time_s)
+    first, second = motion(ONE, gap[0]), motion(ONE, gap[1])
+    way = second.gain * first.decay + first.gain
+    cross = first.gain * 4.0 * way + first.noise_pp + second.gain * first.noise_pv
+    last = (
+        way**2 * 4.0 + first.noise_pp + 2.0 * second.gain * first.noise_pv + second.gain**2 * first.noise_vv + second.noise_pp
+    )
+    joint = np.array([[first.gain**2 * 4.0 + first.noise_pp, cross], [cross, last]])[..., 0] + 25.0 + 25.0 * np.eye(2)
+    offset = seen.position_m[1:] - seen.position_m[0]
+    distance = np.einsum("is,ij,js->", offset, np.linalg.inv(joint), offset)
+    wanted = -0.5 * distance - np.log(np.linalg.det(joint)) - 2.0 * np.log(2.0 * np.pi)
+    np.testing.assert_allclose(total, wanted, rtol=1e-9)
+
+
+def test_mixing_keeps_mean_and_covariance_of_the_whole():
+    seen = stream(4)
+    results = []
+    for switch in (0.0, 0.7):
+        modes = Modes(TWO.relaxation_s, TWO.speed_mps, TWO.share, switch)
+        tracks = Tracks.none(2)
+        for index, time_s in enumerate(seen.time_s[:2]):
+            detection = Detection(time_s, seen.position_m[index], seen.covariance_m2[index])
+            tracks = updated(tracks, modes, detection, np.array([0]))
+        share, mean = np.exp(tracks.log_share[0, 0]), tracks.mean[0, 0]
+        overall = share @ mean
+        apart = mean - overall
+        total = np.einsum("c,cij->ij", share, tracks.covariance[0, 0] + apart[:, :, None] * apart[:, None])
+        results.append((overall, total))
+    np.testing.assert_allclose(results[0][0], results[1][0], rtol=1e-9)
+    np.testing.assert_allclose(results[0][1], results[1][1], rtol=1e-9)
+
+
+def test_silence_and_the_next_detection_are_one_law():
+    """What is not silent by a moment was detected or lies ahead: minus the silence's slope is density plus nothing else."""
+    tracks = updated(Tracks.none(2), TWO, Detection(0.0, np.zeros(2), np.eye(2)), np.array([0]))
+    moments = np.linspace(0.0, 3000.0, 300_001)
+    stays = habits()
+    density = np.exp([log_silence(tracks, stays, moment)[1][0, 0] for moment in moments[::100]])
+    silence = np.exp([log_silence(tracks, stays, moment)[0][0, 0] for moment in moments[::100]])
+    np.testing.assert_allclose(silence, 1.0 - np.concatenate([[0], np.cumsum(0.5 * (density[1:] + density[:-1]))]), atol=2e-4)
+    leaves = np.exp(log_silence(tracks, habits(leave_hz=0.01), 1e7)[0][0, 0])
+    assert 0.0 < leaves < 1.0
+    assert np.exp(log_silence(tracks, stays, 1e7)[0][0, 0]) < 1e-5
+
+
+@pytest.mark.parametrize("num", [1, 2, 5, 9])
+def test_resampling_keeps_the_heavy_and_is_right_on_average(num):
+    weight = np.array([0.3, 0.02, 0.2, 0.0, 0.1, 0.05, 0.15, 0.03, 0.1, 0.05])
+    level = threshold(weight[weight > 0], num) if num < 9 else 0.0
+    if num < 9:
+        np.testing.assert_allclose(np.minimum(weight / level, 1.0).sum(), num)
+    mean = np.zeros(len(weight))
+    for uniform in (np.arange(2000) + 0.5) / 2000:
+        index, new = resample(weight, num, uniform)
+        assert len(np.unique(index)) == len(index) <= num
+        np.testing.assert_allclose(new.sum(), 1.0)
+        np.testing.assert_allclose(new[weight[index] > level], weight[index][weight[index] > level], rtol=1e-9)
+        mean[index] += new / 2000
+    np.testing.assert_allclose(mean, weight, atol=2e-3)
