@@ -29,8 +29,8 @@ from pipeline.spikes import is_spike
 from pipeline.stamps import moment_ns
 from pipeline.tables import Frame, write_table
 from pipeline.thinning import ThinningConfig, is_seen, noise
-from pipeline.transform_messages import has_transforms, read_transforms
-from pipeline.transforms import Limits, TransformTree
+from pipeline.transform_messages import LogTransforms
+from pipeline.transforms import Limits
 from schemas.tables import DETECTIONS, POSES, TRUTH
 
 _STAMPS_APART_S = 3600.0
@@ -108,7 +108,7 @@ def extract(directory: Path, config: ExtractConfig, progress: Progress, force: b
 def write_tables(log: MissionLog, folder: Path, config: ExtractConfig, progress: Progress) -> dict[str, Any]:
     """Write the files of the stage for `log` into `folder`; the summary."""
     stated = {"detections": config.detections, "truth": config.truth, "poses": config.poses}
-    transforms = _Transforms(log, progress)
+    transforms = LogTransforms(log, progress)
     with _about(log):
         channels = selected_channels(log.channels, config.topics)
         readers = select_readers(stated, config.suggest, config.thinning, channels)
@@ -128,6 +128,11 @@ def write_tables(log: MissionLog, folder: Path, config: ExtractConfig, progress:
     obstacles = collect_obstacles(log, config.obstacles, frame, progress.note)
     write_obstacles(folder / OBSTACLES_NAME, obstacles)
     _tell(counts, detections.positions, log, progress)
+    transforms.tell()
+    if frame.frame_id.lower().endswith("ned"):
+        progress.note(
+            f'extract: frame {frame.frame_id} may be north-east-down; if so give its sources frame_convention = "ned"'
+        )
     summary = _summary(log, readers, detections.positions, truth, poses, frame, counts, len(obstacles))
     return summary | {"transforms": transforms.summary(counts)}
 
@@ -150,35 +155,8 @@ def _cut_ns(log: MissionLog, config: ExtractConfig) -> tuple[int | None, int | N
     return start, None if end is None else end + 1
 
 
-class _Transforms:
-    """The log's transforms, read at the first need."""
-
-    def __init__(self, log: MissionLog, progress: Progress) -> None:
-        self._log, self._progress = log, progress
-        self._tree = TransformTree()
-        self.counts: Counter[str] = Counter()
-
-    def read(self) -> TransformTree:
-        """The trees; empty ones for a log without transforms."""
-        if not self._tree.links and has_transforms(self._log.channels):
-            self._tree = read_transforms(self._log, self.counts, self._progress)
-            for problem in self._tree.problems:
-                self._progress.note(f"extract: {problem}")
-        return self._tree
-
-    def summary(self, counts: Counter[str]) -> dict[str, Any]:
-        """What was moved, what could not be, and what is wrong with the transforms."""
-        names = ("transformed", "no_transform", "bad_transforms", "undecodable_transforms")
-        both = counts + self.counts
-        return {
-            "num_frames": len(self._tree.links),
-            "problems": list(self._tree.problems),
-            **{name: both[name] for name in names},
-        }
-
-
 def _rows_in_frame(
-    readers: Sequence[ChannelReader], config: ExtractConfig, counts: Counter[str], transforms: _Transforms
+    readers: Sequence[ChannelReader], config: ExtractConfig, counts: Counter[str], transforms: LogTransforms
 ) -> tuple[dict[str, Positions], Frame]:
     """The rows of every role, placed in the mission frame and thinned, and that frame."""
     rows = {role: _columns(role, readers, counts) for role in ROLES}
@@ -190,7 +168,8 @@ def _rows_in_frame(
     rows = {role: in_enu(positions) for role, positions in rows.items()}
     frame = mission_frame(rows[primary], [rows[role] for role in ROLES if role != primary], config.datum)
     for role in ROLES:
-        rows[role] = _without_spikes(_placed(role, rows[role], frame, counts), config.max_speed_mps, counts)
+        placed = _placed(role, rows[role], frame, counts, transforms.apart)
+        rows[role] = _without_spikes(placed, config.max_speed_mps, counts)
     if config.thinning.enabled:
         rows["detections"] = _thinned(rows[primary], config.thinning)
         if len(rows["detections"]) == 0:
@@ -234,9 +213,15 @@ def _check_any(role: str, rows: Positions, counts: Counter[str]) -> None:
     raise InputError(reason)
 
 
-def _placed(role: str, rows: Positions, frame: Frame, counts: Counter[str]) -> Positions:
-    """Rows in the mission frame. What the user asked for must fit; what was only suggested is left out and counted."""
+def _placed(role: str, rows: Positions, frame: Frame, counts: Counter[str], apart: set[str]) -> Positions:
+    """Rows in the mission frame. What the user asked for must fit; what was only suggested is left out and counted.
+
+    The frames of what is left out are added to `apart`.
+    """
     placed, num_elsewhere = place(rows, frame)
+    if num_elsewhere:
+        geodetic = {"latitude and longitude"} if (rows.is_geodetic & (not frame.is_georeferenced)).any() else set()
+        apart |= geodetic | {str(name) for name in rows.frame_id[~rows.is_geodetic]} - {frame.frame_id, ""}
     if num_elsewhere and rows.is_stated.any():
         raise InputError(
             f"{role}: {num_elsewhere} positions are not in the mission frame {frame.frame_id!r}, and no transform of the log "

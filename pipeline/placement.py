@@ -40,7 +40,8 @@ def bring_together(
     at moments without a transform are left out and counted.
     """
     named = {name for positions in rows.values() for name, is_geodetic in _frames(positions) if name and not is_geodetic}
-    if not named or (placing.frame is None and len(named) == 1 and named <= FIXED_FRAMES):
+    is_metric = placing.frame is not None or any(name and not is_geodetic for name, is_geodetic in _frames(rows[primary]))
+    if not named or not is_metric or (placing.frame is None and len(named) == 1 and named <= FIXED_FRAMES):
         return dict(rows)
     tree = read_tree()
     target = target_frame(rows[primary], tree, placing.frame)
@@ -136,7 +137,9 @@ def _moved(positions: Positions, target: str, tree: TransformTree, limits: Limit
 
 def _turned(positions: Positions, rows: np.ndarray, rotation: np.ndarray, translation_m: np.ndarray) -> Positions:  # type: ignore[type-arg]
     """The positions with those of `rows` (a mask or numbers) turned and moved, and their covariances turned."""
-    columns = {name: getattr(positions, name).copy() for name in ("first", "second", "z_m", "covariance_m2", "height_covariance_m2")}
+    columns = {
+        name: getattr(positions, name).copy() for name in ("first", "second", "z_m", "covariance_m2", "height_covariance_m2")
+    }
     heights = columns["z_m"][rows]
     points = np.column_stack([columns["first"][rows], columns["second"][rows], np.nan_to_num(heights)])
     moved = np.einsum("nij,nj->ni", rotation, points) + translation_m

@@ -8,7 +8,6 @@ log wherever in it it stands; Foxglove has no such mark, so there a transform th
 import math
 from array import array
 from collections import Counter
-from collections.abc import Sequence
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -110,9 +109,46 @@ class _Reader:
 _MIN_NORM = 1e-6
 
 
-def has_transforms(channels: Sequence[Channel]) -> bool:
-    """Whether any channel tells where frames are."""
-    return any(normalise_schema(channel.schema_name) in _FORMS and channel.message_count != 0 for channel in channels)
+_FAULTS = {
+    "bad_transforms": "transforms lack a field, or are no rotation and translation, and were skipped",
+    "undecodable_transforms": "messages with transforms cannot be decoded and were skipped",
+}
+
+
+class LogTransforms:
+    """The transforms of a log, read at the first need; `apart` are frames that were found not to be joined to the mission's."""
+
+    def __init__(self, log: MissionLog, progress: Progress) -> None:
+        self._log, self._progress = log, progress
+        self._tree: TransformTree | None = None
+        self.counts: Counter[str] = Counter()
+        self.apart: set[str] = set()
+
+    def read(self) -> TransformTree:
+        """The trees; empty ones for a log without transforms."""
+        if self._tree is None:
+            self._tree = read_transforms(self._log, self.counts, self._progress)
+        return self._tree
+
+    def summary(self, counts: Counter[str]) -> dict[str, Any]:
+        """What was moved (in `counts`), what could not be, and what is wrong with the transforms."""
+        tree, both = self._tree or TransformTree(), counts + self.counts
+        return {
+            "num_frames": len(tree.links),
+            "problems": list(tree.problems),
+            "unconnected_frames": sorted(self.apart),
+            **{name: both[name] for name in ("transformed", "no_transform", *_FAULTS)},
+        }
+
+    def tell(self) -> None:
+        """One line for each kind of thing that is wrong."""
+        for problem in self._tree.problems if self._tree is not None else ():
+            self._progress.note(f"extract: {problem}")
+        if self.apart:
+            self._progress.note(f"extract: no transform joins the detections' frame to {', '.join(sorted(self.apart))}")
+        for name, meaning in _FAULTS.items():
+            if self.counts[name]:
+                self._progress.note(f"extract: {self.counts[name]} {meaning}")
 
 
 def read_transforms(log: MissionLog, counts: Counter[str], progress: Progress) -> TransformTree:
@@ -130,6 +166,8 @@ def read_transforms(log: MissionLog, counts: Counter[str], progress: Progress) -
             except UndecodableChannel as error:
                 counts["undecodable_transforms"] += channel.message_count or 0
                 progress.note(f"extract: {error}")
+    if not readers:
+        return TransformTree()
     with progress.bar(log.size_bytes, "transforms", unit="B", scale=True) as bar:
         for raw in log.messages({reader.channel.topic for reader in readers.values()}, on_bytes=bar.update):
             if raw.channel.id in readers:

@@ -15,11 +15,14 @@ from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
 from ros_messages import Builder, store_with
 from rosbags.typesys import Stores
 from scipy.spatial.transform import Rotation
-from small_logs import Row, detection, fix, stamp, time_ns
+from small_logs import Row, detection, fix, stamp, time_ns, write_log
 from test_extract import Extracted, fails, mk, run
 from test_presets import protobuf_row
 
 from cadence.errors import ConfigError, InputError
+from pipeline.extract import ExtractConfig, write_tables
+from pipeline.logs.reader import open_log
+from pipeline.progress import Progress
 
 ROS, ROS1 = Builder(store_with()), Builder(store_with(base=Stores.ROS1_NOETIC))
 TARGET = np.array([40.0, 25.0, 3.0])
@@ -239,6 +242,21 @@ def test_north_east_down(tmp_path: Path) -> None:
     columns = [found.detections[name][0].as_py() for name in ("cov_xx_m2", "cov_xy_m2", "cov_yy_m2")]
     assert columns == pytest.approx([4.0, 1.0, 9.0]) and found.frame.frame_id == "local_ned_enu"
     assert run(tmp_path, rows).detections["x_m"].to_pylist() == [12.0, 13.0, 14.0]
+
+
+def test_what_was_left_out_is_told_in_one_line_each(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    other = Row("/truth/T0", "mission.Detection", 2.0, detection(2.0, 1.0, 1.0, frame="cart").message)
+    broken = Row("/more/tf", "tf2_msgs/msg/TFMessage", 1.0, b"\x00\x01\x00\x00", "cdr", "ros2msg", b"not a schema")
+    log = write_log(tmp_path / "log.mcap", [seen_row(2.0), seen_row(50.0), other, broken, *cruise(ros2_row)])
+    summary = write_tables(open_log(log), tmp_path, ExtractConfig(), Progress())
+    told = capsys.readouterr().err
+    assert summary["transforms"]["unconnected_frames"] == ["cart"]
+    assert "no transform joins the detections' frame to cart" in told
+    assert "1 messages with transforms cannot be decoded" in told
+    assert "1 positions have no transform near enough in time" in told
+    ned = write_log(tmp_path / "ned.mcap", [detection(float(i), i, i, frame="local_ned") for i in range(3)])
+    write_tables(open_log(ned), tmp_path, ExtractConfig(), Progress())
+    assert 'give its sources frame_convention = "ned"' in capsys.readouterr().err
 
 
 def test_a_sensor_in_a_world_that_is_north_east_down(tmp_path: Path) -> None:
