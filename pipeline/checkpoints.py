@@ -1,6 +1,7 @@
 """Checkpoints: weights as safetensors (never pickle), everything else as JSON beside them."""
 
 import dataclasses
+import functools
 import json
 import os
 from collections.abc import Mapping
@@ -77,10 +78,17 @@ def read_info(path: Path) -> CheckpointInfo:
     return read_config(CheckpointInfo, content, str(beside))
 
 
+@functools.lru_cache(maxsize=2)  # a worker runs many logs with the same weights; networks get copies
+def _tensors(path: Path, size_bytes: int, modified_ns: int) -> dict[str, Tensor]:
+    tensors: dict[str, Tensor] = load_file(path)
+    return tensors
+
+
 def load_weights(path: Path, network: nn.Module) -> None:
     """Put the weights at `path` into `network`; `ConfigError` names the first tensor that does not fit."""
     try:
-        tensors: dict[str, Tensor] = load_file(path)
+        about = path.stat()
+        tensors = _tensors(path, about.st_size, about.st_mtime_ns)
     except (OSError, SafetensorError) as error:
         raise ConfigError(f"{path}: not readable as safetensors ({error}); take the checkpoint again") from error
     expected = network.state_dict()
