@@ -22,6 +22,12 @@ NUM_ATTEMPTS: Final = 3
 """How many workers a task may cost before it counts as failed."""
 
 _REASON_LENGTH: Final = 120
+_SETTINGS: Final = {
+    "RAY_USAGE_STATS_ENABLED": "0",  # nothing is sent to its makers
+    "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",  # what it will do anyway in future, without saying so each time
+    "RAY_DISABLE_FAILURE_SIGNAL_HANDLER": "1",  # being asked to stop is no failure
+    "RAY_worker_niceness": "0",  # workers count as much as those of the local engine
+}
 
 
 def run_on_ray(
@@ -171,8 +177,8 @@ def _reason(error: Exception) -> str:
 
 
 def _ray() -> Any:
-    # Before Ray is imported, which reads these: nothing is sent to its makers, nothing is told but by us.
-    for name, value in (("RAY_USAGE_STATS_ENABLED", "0"), ("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")):
+    # Before Ray is imported, which reads them.
+    for name, value in _SETTINGS.items():
         os.environ.setdefault(name, value)
     try:
         import ray
