@@ -134,7 +134,21 @@ def _cdr_decoder(channel: Channel) -> Decoder:
     return decode_plain
 
 
+def cdr_types(channel: Channel) -> tuple[Typestore, str]:
+    """The types that the schema of a CDR channel defines, and the name of the messages' own.
+
+    Raises `UndecodableChannel` where the schema cannot be read.
+    """
+    with _named(channel, UndecodableChannel, "cannot be decoded"):
+        return _cdr_types(channel)
+
+
 def _rosbags_cdr_decoder(channel: Channel) -> Decoder:
+    store, name = _cdr_types(channel)
+    return lambda data: store.deserialize_cdr(data, name)
+
+
+def _cdr_types(channel: Channel) -> tuple[Typestore, str]:
     text = channel.schema_data.decode("utf-8")
     if channel.schema_encoding == "ros2idl":
         types = get_types_from_idl(_without_separators(text))
@@ -143,8 +157,7 @@ def _rosbags_cdr_decoder(channel: Channel) -> Decoder:
     else:
         raise ValueError(f"schema encoding {channel.schema_encoding!r} is not known for CDR")
     store = _store(types, Stores.EMPTY)
-    name = _type_name(store, channel.schema_name)
-    return lambda data: store.deserialize_cdr(data, name)
+    return store, _type_name(store, channel.schema_name)
 
 
 def _ros1_decoder(channel: Channel) -> Decoder:

@@ -116,10 +116,10 @@ class Timeline:
             for _, number, _, block in self.places:
                 future = ahead.submit(self._load, number, block) if self._is_wanted(number, block) else None
                 if coming is not None:
-                    yield *coming[:2], coming[2] and coming[2].result()
+                    yield coming[0], coming[1], _result(coming[2])
                 coming = number, block, future
             if coming is not None:
-                yield *coming[:2], coming[2] and coming[2].result()
+                yield coming[0], coming[1], _result(coming[2])
 
     def _is_wanted(self, number: int, block: Block) -> bool:
         is_in_time = block.start_ns < self.selection.end_ns and block.end_ns >= self.selection.start_ns
@@ -190,6 +190,10 @@ class Timeline:
             messages = raw_messages(channels, self._bytes(pieces[number]), rows[stretch[places]])
             found += zip(places.tolist(), messages, strict=True)
         return [message for _, message in sorted(found, key=lambda item: item[0])]
+
+
+def _result(future: Future[tuple[bytes, Rows]] | None) -> tuple[bytes, Rows] | None:
+    return None if future is None else future.result()
 
 
 def read_span(file: BinaryIO, offset: int, length: int) -> bytes:

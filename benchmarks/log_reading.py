@@ -1,0 +1,258 @@
+"""How fast are logs read, beside the readers of `mcap` and `mcap-ros2-support`, and in how much memory?
+
+A mixed log of ten topics is written into a temporary folder (see `mixed_logs`), then both sides read it in turns, in one
+process. Peak memory is that of a process of its own for every size, as the operating system counts it.
+
+    python benchmarks/log_reading.py --publish docs/benchmarks
+"""
+
+import argparse
+import hashlib
+import os
+import struct
+import subprocess
+import sys
+import tempfile
+import time
+import zlib
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+SIZE_MB = 300.0
+MEMORY_SIZES_MB = (50.0, 200.0, 800.0, 2000.0)
+TOPIC = "/odom"
+FIELDS = (
+    "header.stamp.sec", "header.stamp.nanosec", "header.frame_id", "pose.pose.position.x", "pose.pose.position.y",
+    "pose.pose.position.z", "pose.covariance",
+)  # fmt: skip
+_UNIT = 1024 if sys.platform.startswith("linux") else 1
+_IMPORT = "import sys; from pipeline.logs.reader import open_log"
+_READ = _IMPORT + "; log = open_log(sys.argv[1]); n = sum(1 for _ in log.messages()); sys.exit(n != log.health.num_messages)"
+_OPEN = _IMPORT + "; sys.exit(open_log(sys.argv[1]).health.is_complete)"
+
+
+@dataclass(frozen=True)
+class Cost:
+    """The least of several runs: wall time, and time on all processors."""
+
+    wall_s: float
+    cpu_s: float
+
+
+@dataclass(frozen=True)
+class Row:
+    """What both sides did, and what it cost each."""
+
+    what: str
+    theirs: Cost
+    ours: Cost
+
+
+def peak_of(command: str, path: Path | str) -> tuple[int, float, float]:
+    """Exit code, peak of the resident memory in bytes and seconds of a child process. This process must stay small."""
+    began = time.perf_counter()
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    with subprocess.Popen([sys.executable, "-c", command, str(path)], env=environment) as child:
+        _, status, usage = os.wait4(child.pid, 0)
+        child.returncode = os.waitstatus_to_exitcode(status)
+        return child.returncode, usage.ru_maxrss * _UNIT, time.perf_counter() - began
+
+
+def memory_lines(folder: Path, sizes_mb: Iterable[float]) -> list[str]:
+    """Peak memory over the size of the log: checked, then read as a whole."""
+    lines = [f"| none: only imports | - | {peak_of(_IMPORT, '')[1] / 1e6:.0f} |"]
+    for size_mb in sizes_mb:
+        path = folder / "large.mcap"
+        command = "import sys; from pathlib import Path; from benchmarks.mixed_logs import write_mixed_log"
+        # In a process of its own: a child starts with its parent's peak.
+        code = peak_of(f"{command}; write_mixed_log(Path(sys.argv[1]), {size_mb}, distinct_s=20)", path)[0]
+        code, peak, _ = peak_of(_READ, path) if code == 0 else (code, 0, 0.0)
+        if code:
+            raise SystemExit(f"log_reading: a log of {size_mb} MB ended with exit code {code}")
+        lines.append(f"| mixed log | {path.stat().st_size / 1e6:.0f} | {peak / 1e6:.0f} |")
+        path.unlink()
+    return lines
+
+
+def bomb_lines(folder: Path) -> list[str]:
+    """Seconds and peak memory of opening two small files that want to fill the memory or to keep the processor busy."""
+    import zstandard
+
+    zeros = bytes(2**28)
+    packed = zstandard.compress(zeros)
+    head = struct.pack("<QQQII", 1, 2, len(zeros), zlib.crc32(zeros), 4) + b"zstd" + struct.pack("<Q", len(packed))
+    start = b"\x89MCAP0\r\n" + struct.pack("<BQII", 1, 8, 0, 0)
+    bombs = {
+        "a message of 2 GiB, as it says": start + struct.pack("<BQ", 5, 2**31) + bytes(65_000),
+        "a chunk of 256 MiB of zeros": start + struct.pack("<BQ", 6, len(head) + len(packed)) + head + packed,
+    }
+    lines = []
+    for name, data in bombs.items():
+        path = folder / "bomb.mcap"
+        path.write_bytes(data)
+        code, peak, seconds = peak_of(_OPEN, path)
+        verdict = "named as damaged" if code == 0 else "NOT NOTICED"
+        lines.append(f"| {name} | {len(data) / 1e3:.0f} | {verdict} | {seconds:.1f} | {peak / 1e6:.0f} |")
+    return lines
+
+
+def theirs(path: Path) -> dict[str, Callable[[], int]]:
+    """What `mcap` and `mcap-ros2-support` are asked to do; each returns the number of messages."""
+    from mcap.reader import make_reader
+    from mcap_ros2.decoder import DecoderFactory
+
+    def read(topics: list[str] | None = None) -> int:
+        with path.open("rb") as file:
+            return sum(1 for _ in make_reader(file).iter_messages(topics))
+
+    def decode() -> int:
+        with path.open("rb") as file:
+            return sum(1 for _ in make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages([TOPIC]))
+
+    return {"all": read, "topic": lambda: read([TOPIC]), "decoded": decode}
+
+
+def ours(path: Path) -> dict[str, tuple[str, Callable[[], int]]]:
+    """What we are asked to do, and to which of `theirs` it is compared."""
+    from pipeline.logs.cdr_fields import CdrFields
+    from pipeline.logs.decode import decoder_for
+    from pipeline.logs.reader import MissionLog, open_log, reopen
+
+    checked = open_log(path)
+    channel = next(channel for channel in checked.channels if channel.topic == TOPIC)
+
+    def known() -> MissionLog:
+        return reopen([path], checked.health)
+
+    def decode() -> int:
+        decoder = decoder_for(channel)
+        return sum(1 for message in known().messages([TOPIC]) if decoder(message.data) is not None)
+
+    def fields() -> int:
+        reader = CdrFields(channel, FIELDS)
+        return sum(int(reader.columns(batch)[0].sum()) for batch in known().batches([TOPIC]))
+
+    return {
+        "all messages": ("all", lambda: sum(1 for _ in known().messages())),
+        "all messages, in columns": ("all", lambda: sum(map(len, known().batches()))),
+        "all messages, and the whole log checked before": ("all", lambda: sum(1 for _ in open_log(path).messages())),
+        "one topic": ("topic", lambda: sum(1 for _ in known().messages([TOPIC]))),
+        "one topic, in columns": ("topic", lambda: sum(map(len, known().batches([TOPIC])))),
+        "one topic, every message decoded": ("decoded", decode),
+        "one topic, decoded to columns: stamp, frame, position, covariance": ("decoded", fields),
+    }
+
+
+def compare(path: Path, repeats: int) -> list[Row]:
+    """All rows of the table of times; both sides in turns."""
+    _check_equal(path)
+    their_work, our_work = theirs(path), ours(path)
+    costs: dict[str, list[Cost]] = {}
+    for _ in range(repeats):
+        for name, work in [*their_work.items(), *((name, work) for name, (_, work) in our_work.items())]:
+            costs.setdefault(name, []).append(_measure(work))
+    return [Row(name, _least(costs[other]), _least(costs[name])) for name, (other, _) in our_work.items()]
+
+
+def _check_equal(path: Path) -> None:
+    """Both readers give the same messages in the same order."""
+    from mcap.reader import make_reader
+
+    from pipeline.logs.reader import open_log
+
+    digests = [hashlib.sha256(), hashlib.sha256()]
+    with path.open("rb") as file:
+        for _, channel, message in make_reader(file, validate_crcs=True).iter_messages():
+            head = (channel.topic, message.log_time, message.publish_time, message.sequence)
+            digests[0].update(repr(head).encode() + message.data)
+    for raw in open_log(path).messages():
+        head = (raw.channel.topic, raw.log_time_ns, raw.publish_time_ns, raw.sequence)
+        digests[1].update(repr(head).encode() + raw.data)
+    if digests[0].digest() != digests[1].digest():
+        raise SystemExit("log_reading: the readers do not give the same messages")
+
+
+def _least(costs: list[Cost]) -> Cost:
+    return Cost(min(cost.wall_s for cost in costs), min(cost.cpu_s for cost in costs))
+
+
+def _measure(work: Callable[[], int]) -> Cost:
+    wall, cpu = time.perf_counter(), time.process_time()
+    if work() == 0:
+        raise SystemExit("log_reading: nothing was read")
+    return Cost(time.perf_counter() - wall, time.process_time() - cpu)
+
+
+def main() -> int:
+    """The tables, printed and published."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--publish", type=Path, help="folder for log_reading.md")
+    parser.add_argument("--size-mb", type=float, default=SIZE_MB, help="size of the log that is timed")
+    parser.add_argument("--memory-sizes-mb", type=float, nargs="*", default=MEMORY_SIZES_MB, help="sizes for peak memory")
+    parser.add_argument("--repeats", type=int, default=3, help="runs of which the fastest counts")
+    arguments = parser.parse_args()
+    sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+    os.environ["PYTHONPATH"] = str(Path(__file__).resolve().parents[1])
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        memory = memory_lines(folder, arguments.memory_sizes_mb)  # first: children must not start with our peak
+        bombs = bomb_lines(folder)
+        from benchmarks.mixed_logs import write_mixed_log
+        from pipeline.manifest import write_atomic
+        from pipeline.provenance import versions
+
+        path = folder / "mixed.mcap"
+        num_messages = write_mixed_log(path, arguments.size_mb)
+        rows = compare(path, arguments.repeats)
+        size_mb = path.stat().st_size / 1e6
+    made_with = ", ".join(f"{name} {number}" for name, number in versions().items())
+    head = HEAD.format(size_mb=size_mb, num=num_messages, repeats=arguments.repeats, topic=TOPIC, versions=made_with)
+    text = head + "".join(map(_line, rows)) + MEMORY + "\n".join(memory) + "\n" + BOMBS + "\n".join(bombs) + "\n"
+    sys.stdout.write(text)
+    if arguments.publish is not None:
+        write_atomic(arguments.publish / "log_reading.md", text)
+    return 0
+
+
+def _line(row: Row) -> str:
+    wall, cpu = row.theirs.wall_s / row.ours.wall_s, row.theirs.cpu_s / row.ours.cpu_s
+    seconds = (
+        f"{row.theirs.wall_s:.2f} | {row.ours.wall_s:.2f} | **{wall:.1f}** | {row.theirs.cpu_s:.2f} | {row.ours.cpu_s:.2f}"
+    )
+    return f"| {row.what} | {seconds} | **{cpu:.1f}** |\n"
+
+
+HEAD = """# How fast are logs read?
+
+    python benchmarks/log_reading.py
+
+A mixed log as a robot records it: {num} messages of ten topics (ROS 2, CDR), {size_mb:.0f} MB, zstd; `{topic}` is
+`nav_msgs/Odometry`. Both sides read it in turns in one process, {repeats} times; the fastest run counts. *Theirs* is `mcap` with
+its defaults (index, no checksums) and `mcap-ros2-support`; *ours* checks the checksum of every chunk that it reads. Both give
+the same messages in the same order, which the script verifies by a hash. A log that was checked before (by `cadence ingest`) is
+planned by its index; the third row is the first opening, which also compares every byte with checksums, indexes and
+statistics. Wall time gains by a second processor, which unpacks the next chunk meanwhile.
+
+Versions: {versions}.
+
+| what | theirs, s | ours, s | ratio | theirs, CPU s | ours, CPU s | CPU ratio |
+|---|---|---|---|---|---|---|
+"""
+MEMORY = """
+## Peak memory
+
+Logs of the same kind are opened with all checks and then read as a whole.
+
+| log | size, MB | peak, MB |
+|---|---|---|
+"""
+BOMBS = """
+## Files that declare what they do not hold
+
+| file | size, kB | outcome | seconds, with the start of Python | peak, MB |
+|---|---|---|---|---|
+"""
+
+if __name__ == "__main__":
+    sys.exit(main())

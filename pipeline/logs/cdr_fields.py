@@ -1,0 +1,172 @@
+"""Single fields of many CDR messages at once: the schema is walked once, all messages of a batch step by step with it.
+
+Positions, stamps and covariances lie behind strings of varying length at most. Their places are computed as arrays, so that
+no message is decoded as a whole. What the walk cannot pass (lists of structures, optional members) is left to `decode`.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+from rosbags.interfaces import Nodetype
+from rosbags.typesys.store import Typestore
+
+from pipeline.logs.channels import Batch, Channel
+from pipeline.logs.decode import UndecodableChannel, cdr_types
+
+_LITTLE_ENDIAN: Final = (0, 1)
+_HEAD_BYTES: Final = 4
+_DTYPES: Final = {
+    "bool": "u1", "byte": "u1", "char": "u1", "octet": "u1", "int8": "i1", "uint8": "u1", "int16": "<i2", "uint16": "<u2",
+    "int32": "<i4", "uint32": "<u4", "int64": "<i8", "uint64": "<u8", "float32": "<f4", "float64": "<f8",
+}  # fmt: skip
+_MAX_DEPTH: Final = 32
+
+Column = npt.NDArray[Any]
+Places = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class _Member:
+    """One member on the way: a number, `count` numbers, a string (dtype empty) or a list of numbers (count None)."""
+
+    path: str
+    dtype: str
+    count: int | None = 1
+
+
+class CdrFields:
+    """Reads the fields at dotted `paths` from batches of `channel`: numbers, arrays of numbers of fixed length, strings.
+
+    Raises `UndecodableChannel` where that cannot be done without decoding whole messages.
+    """
+
+    def __init__(self, channel: Channel, paths: Sequence[str]) -> None:
+        if channel.message_encoding != "cdr":
+            raise UndecodableChannel(f"{channel.topic}: is not CDR but {channel.message_encoding!r}")
+        self.paths = tuple(paths)
+        self.members = _way(channel, set(paths))
+
+    def columns(self, batch: Batch) -> tuple[npt.NDArray[np.bool_], dict[str, Column]]:
+        """Which of the N messages could be read, and the columns [N] or [N, count] by path (strings as objects).
+
+        Messages that are too short, or in another byte order, are not read; their cells mean nothing.
+        """
+        walker = _Walker(batch)
+        columns = {}
+        for member in self.members:
+            if member.path in self.paths:
+                columns[member.path] = walker.take(member)
+            else:
+                walker.skip(member)
+        return walker.is_sound, columns
+
+
+class _Walker:
+    """Stands at one member in all messages of a batch. Places that leave their message are no longer sound, and stay."""
+
+    def __init__(self, batch: Batch) -> None:
+        self.data, self.end = batch.data, batch.end
+        self.origin: Places = batch.begin + _HEAD_BYTES  # alignment counts from behind the encapsulation
+        self.place: Places = self.origin
+        self.is_sound = self.origin <= self.end
+        head = self._gather("V4", np.where(self.is_sound, batch.begin, 0)).view("u1").reshape(-1, _HEAD_BYTES)
+        self.is_sound = self.is_sound & (head[:, 0] == _LITTLE_ENDIAN[0]) & (head[:, 1] == _LITTLE_ENDIAN[1])
+
+    def take(self, member: _Member) -> Column:
+        """The member's column; stands behind it afterwards."""
+        if not member.dtype:
+            begin, length = self._string()
+            spans = zip(begin.tolist(), (begin + np.maximum(length - 1, 0)).tolist(), self.is_sound.tolist(), strict=True)
+            texts = [self.data[start:end].decode(errors="replace") if sound else "" for start, end, sound in spans]
+            return np.array(texts, dtype=object)
+        dtype = np.dtype(member.dtype)
+        begin = self._advance(dtype.itemsize, dtype.itemsize * (member.count or 0))
+        values = self._gather(f"V{dtype.itemsize * (member.count or 0)}", begin).view(dtype)
+        return values if member.count == 1 else values.reshape(-1, member.count or 0)
+
+    def skip(self, member: _Member) -> None:
+        """Stand behind the member."""
+        if not member.dtype:
+            self._string()
+            return
+        size = np.dtype(member.dtype).itemsize
+        if member.count is not None:
+            self._advance(size, size * member.count)
+            return
+        length = self._length()
+        begin = np.where(length > 0, self._aligned(size), self.place)  # an empty list has no padding
+        self._move(begin, begin + length * size)
+
+    def _string(self) -> tuple[Places, Places]:
+        length = self._length()
+        begin = self.place
+        self._move(begin, begin + length)
+        return begin, np.where(self.is_sound, length, 0)
+
+    def _length(self) -> Places:
+        begin = self._advance(4, 4)
+        return self._gather("<u4", begin).astype(np.int64)
+
+    def _advance(self, alignment: int, size: int) -> Places:
+        begin = self._aligned(alignment)
+        return self._move(begin, begin + size)
+
+    def _aligned(self, alignment: int) -> Places:
+        return self.origin + (self.place - self.origin + alignment - 1) // alignment * alignment
+
+    def _move(self, begin: Places, end: Places) -> Places:
+        """Go to `end` where that is inside the message; `begin`, or 0 where it is not."""
+        self.is_sound = self.is_sound & (end <= self.end)
+        self.place = np.where(self.is_sound, end, self.origin)
+        return np.where(self.is_sound, begin, 0)
+
+    def _gather(self, dtype: str, begin: Places) -> Column:
+        """What lies at the places, read through a view of the data with a stride of one byte."""
+        kind = np.dtype(dtype)
+        num_places = len(self.data) - kind.itemsize + 1
+        if num_places <= 0:
+            return np.zeros(len(begin), kind)
+        view: Column = np.ndarray((num_places,), kind, self.data, strides=(1,))
+        return view[np.where(self.is_sound, begin, 0)]
+
+
+def _way(channel: Channel, wanted: set[str]) -> tuple[_Member, ...]:
+    """The members from the beginning of a message to the last that is wanted."""
+    store, name = cdr_types(channel)
+    way: list[_Member] = []
+    missing = set(wanted)
+    for member in _members(store, name, "", 0):
+        if not missing:
+            break
+        if member is None:
+            raise UndecodableChannel(f"{channel.topic}: {sorted(missing)[0]} lies behind a list of structures")
+        if member.path in missing and member.count is None:
+            raise UndecodableChannel(f"{channel.topic}: {member.path} is a list of varying length")
+        missing.discard(member.path)
+        way.append(member)
+    if missing:
+        raise UndecodableChannel(f"{channel.topic}: {channel.schema_name} has no number or text {sorted(missing)[0]}")
+    return tuple(way)
+
+
+def _members(store: Typestore, name: str, prefix: str, depth: int) -> Iterator[_Member | None]:
+    """The members of a type in order, structures resolved; None for one that cannot be passed."""
+    for field, (kind, detail) in store.fielddefs[name][1]:
+        path = f"{prefix}{field}"
+        if kind == Nodetype.NAME and depth < _MAX_DEPTH:
+            yield from _members(store, str(detail), f"{path}.", depth + 1)
+        elif kind == Nodetype.BASE:
+            yield _plain(path, str(detail[0]), 1)
+        elif kind in (Nodetype.ARRAY, Nodetype.SEQUENCE) and detail[0][0] == Nodetype.BASE and detail[0][1][0] != "string":
+            yield _plain(path, str(detail[0][1][0]), int(detail[1]) if kind == Nodetype.ARRAY else None)
+        else:
+            yield None
+
+
+def _plain(path: str, base: str, count: int | None) -> _Member | None:
+    if base == "string":
+        return _Member(path, "")
+    return _Member(path, _DTYPES[base], count) if base in _DTYPES and count != 0 else None
