@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
+import pyarrow.compute as pc
 import torch
 
 from cadence.association.associate import associate
@@ -34,7 +35,7 @@ from pipeline.windows import (
     track_of,
     window_seeds,
 )
-from schemas.tables import ASSOCIATIONS
+from schemas.tables import ASSOCIATIONS, LABELS
 
 _LEAST_PROBABILITY = 1e-3
 """Rows of ASSOCIATIONS that are less likely at both times are left out."""
@@ -94,6 +95,35 @@ class Association:
             found["probability"] += last[at][detection, agent].tolist()
         return pa.Table.from_pydict(found, schema=ASSOCIATIONS)
 
+    def labels(self, grid: Grid) -> pa.Table:
+        """LABELS: whose each detection is under the likeliest way of each window."""
+        names = pa.array([*self.agent_ids, None], pa.string())  # the label of clutter, -1, is the last
+        parts = []
+        for window, ways in enumerate(self.ways):
+            begin = int(self.origins_ns[window]) - grid.context_ns
+            known = self.stream.time_ns[: ways.num_detections]
+            low = 0 if window == len(self.ways) - 1 else int(np.searchsorted(known, begin, "right"))
+            label = ways.label[0, low:] % (len(self.agent_ids) + 1)
+            columns = [np.full(len(label), window, np.int32), self.row[low : len(known)], names.take(pa.array(label))]
+            parts.append(pa.Table.from_arrays([pa.array(column) for column in columns], schema=LABELS))
+        return pa.concat_tables(parts)
+
+    @staticmethod
+    def of_labels(detections: pa.Table, labels: pa.Table, grid: Grid, default_sigma_m: float = 0.0) -> "Association":
+        """The likeliest way of each window alone, out of LABELS; what a window does not hold is without a label."""
+        nameless = _Nameless.of(detections, default_sigma_m)
+        agent_ids = tuple(sorted(name for name in labels["agent_id"].unique().to_pylist() if name is not None))
+        place = np.full(detections.num_rows, -1)
+        place[nameless.row] = np.arange(len(nameless.row))
+        window, at = labels["window"].to_numpy(), place[labels["detection"].to_numpy()]
+        agent = pc.index_in(labels["agent_id"], value_set=pa.array(agent_ids, pa.string())).fill_null(CLUTTER).to_numpy()
+        ways = []
+        for number, num_known in enumerate(np.searchsorted(nameless.track.time_ns, grid.origins_ns, "right")):
+            label = np.full((1, int(num_known)), CLUTTER)
+            label[0, at[window == number]] = agent[window == number]
+            ways.append(Associations(label, np.ones(1), len(agent_ids)))
+        return Association(nameless.track, nameless.row, grid.origins_ns, tuple(ways), agent_ids)
+
 
 @dataclass(frozen=True, eq=False)
 class Sources:
@@ -131,23 +161,6 @@ def tell_sources(
         planned = plan_grid(first.named(detections), grid)
     association = nameless.told_apart(planned.origins_ns, config, seed, habits)
     return Sources(association.named(detections), planned, association)
-
-
-def associated(
-    detections: pa.Table,
-    origins_ns: Int64s,
-    config: AssociationConfig,
-    seed: int,
-    default_sigma_m: float = 0.0,
-    max_speed_mps: float | None = None,
-) -> Association:
-    """The detections without a name, told apart as far as they are known at each origin [B].
-
-    Detections with a name take no part: the nameless are agents beside those.
-    """
-    nameless = _Nameless.of(detections, default_sigma_m)
-    habits = fit_habits(nameless.stream, config, seed, max_speed_mps)
-    return nameless.told_apart(origins_ns, config, seed, habits)
 
 
 @dataclass(frozen=True, eq=False)

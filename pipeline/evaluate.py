@@ -20,7 +20,7 @@ from torch import Tensor
 from cadence.constraints.checker import segments_in_collision, states_in_collision
 from cadence.errors import CadenceError, InputError, UsageError
 from cadence.types import Estimator, HypothesisSet, WindowBatch
-from pipeline.association import Sources, associated, build_way_windows
+from pipeline.association import Association, Sources, build_way_windows
 from pipeline.config import read_config
 from pipeline.forecasts import ForecastConfig, evaluate_forecasts
 from pipeline.infer import InferConfig
@@ -35,9 +35,9 @@ from pipeline.rivals import RIVALS, FittingData
 from pipeline.score_tables import OWN_NAME, ScoredMission, as_csv, as_json, as_markdown, headline, pool
 from pipeline.scores import Cells, Draw, IsInside, score_in_chunks
 from pipeline.tables import read_table
-from pipeline.windows import UNKNOWN_AGENT, Float64s, Grid, MissionWindows, build_windows, truth_on_grid
+from pipeline.windows import UNKNOWN_AGENT, Grid, MissionWindows, build_windows, truth_on_grid
 
-ASSOCIATIONS_NAME = "associations.parquet"
+LABELS_NAME = "labels.parquet"
 _TRUTH_GAP_STEPS = 2.0
 _CUTOFF_STEPS = 16.0
 _LEAST_PROBABILITY = 0.5
@@ -109,7 +109,7 @@ def evaluate(directory: Path, config: EvaluateConfig, progress: Progress, force:
             f"{inputs[-1]}: not found, so there is nothing to score against; name a truth channel in [[extract.truth]] "
             "or thin a dense one (extract.thinning), then run extract and infer again"
         )
-    inputs += [path for name in (OBSTACLES_NAME, ASSOCIATIONS_NAME) if (path := directory / name).is_file()]
+    inputs += [path for name in (OBSTACLES_NAME, LABELS_NAME) if (path := directory / name).is_file()]
 
     def body(work: Path) -> Mapping[str, Any]:
         scored = score_mission(directory, config, progress)
@@ -239,8 +239,10 @@ def _case(directory: Path, stored: MissionHypotheses, config: EvaluateConfig) ->
     detections, _ = read_table(directory / "detections.parquet", "detections")
     truth, _ = read_table(directory / "truth.parquet", "truth")
     grid, infer = _stored_grid(stored, directory), _infer_config(directory)
-    is_matched = (directory / ASSOCIATIONS_NAME).is_file()
-    windows, fitting, probability = _seen(detections, grid, infer, config.seed, is_matched, stored)
+    path = directory / LABELS_NAME
+    is_matched = path.is_file()
+    labels = read_table(path, "labels")[0] if is_matched else None
+    windows, fitting = _seen(detections, grid, infer, config.seed, labels)
     if not is_matched:
         truth = _named_like(truth, windows.agent_ids, directory)
     names = tuple(sorted(pc.unique(truth["agent_id"]).to_pylist())) if is_matched else windows.agent_ids
@@ -250,29 +252,33 @@ def _case(directory: Path, stored: MissionHypotheses, config: EvaluateConfig) ->
     match = torch.arange(len(names)).expand(len(truth_m), -1)
     if is_matched:
         match = match_to_truth(windows, truth, names, max_gap_s, cutoff_m)
-    is_counted = torch.from_numpy(~(probability <= _LEAST_PROBABILITY))
+    is_counted = _is_counted(stored, windows.agent_ids)
     return _Case(windows, fitting, is_counted, names, match, is_matched, truth_m, is_known, max_gap_s, cutoff_m)
 
 
 def _seen(
-    detections: pa.Table, grid: Grid, infer: InferConfig, seed: int, is_associated: bool, stored: MissionHypotheses
-) -> tuple[MissionWindows, FittingData, Float64s]:
-    """Windows as they were inferred from, what to fit rivals to, and how likely each agent is there [B, A] (NaN: certain)."""
+    detections: pa.Table, grid: Grid, infer: InferConfig, seed: int, labels: pa.Table | None
+) -> tuple[MissionWindows, FittingData]:
+    """Windows as they were inferred from, detections of unknown origin under the likeliest way, and what to fit rivals to."""
     sigma_m = infer.default_sigma_m
-    if not is_associated:
+    if labels is None:
         windows = build_windows(detections, grid, seed, sigma_m)
-        fitting = FittingData.of(detections, grid, windows, sigma_m)
-        return windows, fitting, np.full(windows.batch.is_active.shape, np.nan)
-    # told apart anew: what was known at each origin is not kept in any table, and the same settings tell the same
-    max_speed_mps = infer.guidance.max_speed_mps
-    found = associated(detections, grid.origins_ns, infer.association, infer.seed, sigma_m, max_speed_mps)
+        return windows, FittingData.of(detections, grid, windows, sigma_m)
+    found = Association.of_labels(detections, labels, grid, sigma_m)
     sources = Sources(found.named(detections), grid, found)
-    num_hypotheses = max(len(window.hypothesis) for window in stored.windows)
-    ways = build_way_windows(detections, sources, infer.seed, num_hypotheses, sigma_m)
+    windows = build_way_windows(detections, sources, seed, 1, sigma_m).windows
     named = build_windows(sources.named, grid, seed, sigma_m)
-    fitting = FittingData.of(sources.named, grid, named, sigma_m)
-    reseeded = replace(ways.windows.batch, seeds=named.batch.seeds)
-    return replace(ways.windows, batch=reseeded), fitting, ways.probability
+    return windows, FittingData.of(sources.named, grid, named, sigma_m)
+
+
+def _is_counted(stored: MissionHypotheses, agent_ids: tuple[str, ...]) -> Tensor:
+    """Agents [B, A] that are rather there than not; those of known origin are."""
+    is_counted = torch.ones(len(stored.windows), len(agent_ids), dtype=torch.bool)
+    for b, window in enumerate(stored.windows):
+        for agent in window.agents:
+            if agent.agent_id in agent_ids and agent.probability is not None:
+                is_counted[b, agent_ids.index(agent.agent_id)] = agent.probability > _LEAST_PROBABILITY
+    return is_counted
 
 
 def _default_cutoff_m(truth_m: Tensor, is_known: Tensor) -> float:

@@ -102,7 +102,7 @@ class InferConfig:
 def infer(directory: Path, config: InferConfig, progress: Progress, force: bool = False) -> StageResult:
     """Draw hypotheses for every window of the mission in `directory`: hypotheses.parquet and windows.parquet.
 
-    Where detections of unknown origin were told apart, associations.parquet holds how.
+    Where detections of unknown origin were told apart, associations.parquet and labels.parquet hold how.
     """
     weights = None if config.checkpoint == "none" else find_checkpoint(config.checkpoint)
     inputs = [directory / "detections.parquet", directory / "obstacles.json"]
@@ -127,6 +127,8 @@ def infer(directory: Path, config: InferConfig, progress: Progress, force: bool 
         if plan.seen.sources.association is not None:
             found = plan.seen.sources.association.rows(detections)
             write_table(found, folder / "associations.parquet", "associations", frame)
+            labels = plan.seen.sources.association.labels(plan.seen.sources.grid)
+            write_table(labels, folder / "labels.parquet", "labels", frame)
         counts = windows["status"].value_counts().to_pylist()
         return {
             "num_windows": plan.windows.batch.num_windows,

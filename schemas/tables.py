@@ -85,6 +85,18 @@ ASSOCIATIONS = pa.schema(
 )
 """One row per detection of unknown origin and agent that may have caused it; only for logs that have such detections."""
 
+LABELS = pa.schema(
+    [
+        pa.field("window", pa.int32(), nullable=False),
+        pa.field("detection", pa.int64(), nullable=False),  # row of DETECTIONS, from 0
+        pa.field("agent_id", pa.string()),  # null = clutter
+    ]
+)
+"""One row per window and detection of unknown origin in it, under the likeliest way to tell them apart.
+
+The last window has a row for every detection so far, also for those before its beginning.
+"""
+
 
 def hypotheses_schema(num_steps: int) -> pa.Schema:
     """HYPOTHESES: one row per window, hypothesis and agent (only agents with status ok or infeasible).

@@ -16,7 +16,7 @@ from cadence.diffusion.absolute import AbsoluteSampling
 from cadence.errors import InputError
 from cadence.types import HypothesisSet, WindowBatch
 from pipeline import association
-from pipeline.association import WayWindows, build_way_windows, shared_out, tell_sources
+from pipeline.association import Association, WayWindows, build_way_windows, shared_out, tell_sources
 from pipeline.export import ExportConfig, export, read_hypotheses
 from pipeline.infer import InferConfig, infer
 from pipeline.logs.reader import open_log
@@ -27,7 +27,7 @@ from pipeline.tables import Frame, read_table, write_table
 from pipeline.way_draws import draw_ways
 from pipeline.windows import UNKNOWN_AGENT, GridConfig
 from schemas.channels import message_class
-from schemas.tables import ASSOCIATIONS, DETECTIONS
+from schemas.tables import ASSOCIATIONS, DETECTIONS, LABELS
 
 QUIET = Progress(quiet=True)
 START_NS = 1_700_000_000_000_000_000
@@ -161,7 +161,7 @@ def test_table_of_associations(tmp_path: Path) -> None:
     assert found[15, None]["first_probability"] == 0.125 and found[15, "a1"]["first_probability"] == 0.875
     assert [found[number, "a0"]["first_window"] for number in (0, 6, 8, 14)] == [0, 0, 1, 1]
     infer(directory, dataclasses.replace(CONFIG, is_associated=False), QUIET)
-    assert not (directory / "associations.parquet").exists()
+    assert not (directory / "associations.parquet").exists() and not (directory / "labels.parquet").exists()
     assert read_hypothesis_tables(directory).agent_ids == (UNKNOWN_AGENT,)
 
 
@@ -286,3 +286,21 @@ def test_presets_that_know_a_place_draw_every_way(tmp_path: Path, preset: str) -
     for window in read_hypothesis_tables(directory).windows:
         assert window.weight.sum() == pytest.approx(1.0) and [agent.agent_id for agent in window.agents] == ["a0", "a1"]
         assert all(len(agent.position_m) == 8 and np.isfinite(agent.position_m).all() for agent in window.agents)
+
+
+@pytest.mark.usefixtures("stand_in")
+def test_labels_bring_the_likeliest_way_back(tmp_path: Path) -> None:
+    names: list[str | None] = [None] * 12 + ["wolf"] * 4
+    table = detections(names)
+    directory = mission(tmp_path, table)
+    infer(directory, CONFIG, QUIET)
+    labels, _ = read_table(directory / "labels.parquet", "labels")
+    # the first window begins at 0 s, and a detection at its beginning is none of its; the last one tells of all
+    assert labels["window"].to_pylist() == [0] * 7 + [1] * 12 and labels.schema.equals(LABELS)
+    sources = tell_sources(table, GRID, AssociationConfig(), 0)
+    assert sources.association is not None
+    back = Association.of_labels(table, labels, sources.grid)
+    assert back.named(table).equals(sources.named) and back.agent_ids == ("a0", "a1")
+    for ours, theirs in zip(back.ways, sources.association.ways, strict=True):
+        held = ours.label[0] != -1
+        assert held.any() and np.array_equal(ours.label[0, held], theirs.label[0, held])
