@@ -118,6 +118,8 @@ def export(directory: Path, config: ExportConfig, progress: Progress, force: boo
 def _check_combinable(catalogue: Catalogue) -> None:
     """Raise where a combined file would not hold the log as it was recorded; ingest has looked into every chunk."""
     path, health = catalogue.path, catalogue.health
+    if catalogue.parts:
+        raise InputError(f"{path}: is one part of {len(catalogue.parts)}, which cannot be combined; export without combined")
     if not health.is_complete:
         raise InputError(f"{path}: is damaged ({health.problems[0]}) and cannot be combined; export without combined")
     if hash_file(path) != catalogue.sha256:
@@ -126,7 +128,7 @@ def _check_combinable(catalogue: Catalogue) -> None:
 
 def _export(directory: Path, work: Path, catalogue: Catalogue, config: ExportConfig, progress: Progress) -> dict[str, Any]:
     mission = _read_mission(directory, catalogue, config)
-    stem = catalogue.path.stem
+    stem = catalogue.name
     side = work / f"{stem}.cadence.mcap"
     counts = _write_side_file(side, directory, mission, config, progress)
     if config.combined:
