@@ -2,10 +2,12 @@ import json
 
 import numpy as np
 import pytest
+from logs_fixture import straight_line, write_log
 from mcap.writer import Writer
 from recorder_fixture import NUM_MESSAGES, START_NS, STEP_NS, recording
 
 from cadence.errors import InputError
+from pipeline.extract import ExtractConfig, extract
 from pipeline.ingest import CATALOGUE_NAME, IngestConfig, ingest, open_catalogued_log, read_catalogue
 from pipeline.logs.reader import open_log
 from pipeline.manifest import hash_file
@@ -159,3 +161,52 @@ def test_same_log_gives_the_same_bytes(log, tmp_path):
         ingested(log, tmp_path / name)
         written.append((tmp_path / name / CATALOGUE_NAME).read_bytes())
     assert written[0] == written[1]
+
+
+@pytest.fixture
+def parts(tmp_path):
+    """One target, recorded in two files."""
+    folder = tmp_path / "bag"
+    folder.mkdir()
+    fixes = straight_line()
+    (folder / "metadata.yaml").write_text("relative_file_paths:\n  - bag_0.mcap\n  - bag_1.mcap\n")
+    return [write_log(folder / f"bag_{i}.mcap", fixes[6 * i : 6 * i + 6]) for i in range(2)]
+
+
+def test_parts_are_one_mission(parts, tmp_path):
+    out = tmp_path / "out"
+    assert ingested(parts, out).summary["parts"] == [str(path) for path in parts]
+    catalogue = read_catalogue(out)
+    assert catalogue.name == "bag" and catalogue.path == parts[0] and catalogue.health.num_messages == 12
+    assert [(part.path, part.sha256, part.size_bytes) for part in catalogue.parts] == [
+        (path, hash_file(path), path.stat().st_size) for path in parts
+    ]
+    assert [channel.num_messages for channel in catalogue.channels] == [12]
+    assert len(list(open_catalogued_log(catalogue).messages())) == 12
+    assert extract(out, ExtractConfig(), QUIET).summary["num_detections"] == 12
+    assert ingested(parts, out).status == ingested(parts[0].parent, out).status == "skipped"  # the folder is its parts
+    assert ingested(parts[:1], out).status == "done"
+
+
+def test_changed_and_missing_parts_are_noticed(parts, tmp_path):
+    out = tmp_path / "out"
+    ingested(parts, out)
+    catalogue = read_catalogue(out)
+    whole = parts[1].read_bytes()
+    parts[1].write_bytes(whole[:-20])
+    with pytest.raises(InputError, match=r"bag_1\.mcap: was changed after"):
+        open_catalogued_log(catalogue)
+    assert ingested(parts, out).status == "done" and read_catalogue(out).health.problems
+    parts[1].unlink()
+    with pytest.raises(InputError, match=r"bag_1\.mcap: the log that was ingested is not there"):
+        open_catalogued_log(catalogue)
+    result = ingested(parts[:1], out)
+    assert not result.summary["is_complete"] and "bag_1.mcap: is named in" in result.summary["problems"][0]
+
+
+def test_parts_of_one_name_are_refused(parts, tmp_path):
+    other = tmp_path / "other"
+    other.mkdir()
+    (other / parts[0].name).write_bytes(parts[1].read_bytes())
+    with pytest.raises(InputError, match="same name"):
+        ingested([parts[0], other / parts[0].name], tmp_path / "out")
