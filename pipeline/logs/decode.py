@@ -25,6 +25,9 @@ from pipeline.logs.reader import Channel
 Decoder = Callable[[bytes], Any]
 
 _IDENTIFIER: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")
+_TEXT = r'"(?:[^"\\]|\\.)*"'
+_COMMENT_OR_TEXT: Final = re.compile(rf"{_TEXT}|/\*.*?\*/|//[^\n]*", re.DOTALL)
+_ANNOTATION: Final = re.compile(rf'@\w+\s*\((?:[^()"]|{_TEXT})*\)')
 _PLAIN_CDR: Final = (b"\x00\x00", b"\x00\x01")
 _MAX_REASON = 160
 _STAMPS: Final = {
@@ -151,7 +154,7 @@ def _rosbags_cdr_decoder(channel: Channel) -> Decoder:
 def _cdr_types(channel: Channel) -> tuple[Typestore, str]:
     text = channel.schema_data.decode("utf-8")
     if channel.schema_encoding == "ros2idl":
-        types = get_types_from_idl(_without_separators(text))
+        types = get_types_from_idl(_plain_idl(text))
     elif channel.schema_encoding == "ros2msg":
         types = get_types_from_msg(text, channel.schema_name)
     else:
@@ -198,7 +201,13 @@ def _type_name(store: Typestore, schema_name: str) -> str:
     raise ValueError(f"the schema does not define {schema_name}")
 
 
-def _without_separators(text: str) -> str:
-    """IDL of several files in one schema without the lines between them (=== and IDL: name) and without `#include`."""
+def _plain_idl(text: str) -> str:
+    """IDL of several files in one schema, with the definitions alone.
+
+    Between the files stand === and IDL: name, in them #include. Comments and annotations with arguments (@verbatim, which
+    holds comments, and @default, @range, @unit) say nothing about the bytes and cost the parser most of its time.
+    """
     is_definition = (not line.startswith(("IDL: ", "#")) and set(line) != {"="} for line in text.splitlines())
-    return "\n".join(itertools.compress(text.splitlines(), is_definition))
+    definitions = "\n".join(itertools.compress(text.splitlines(), is_definition))
+    uncommented = _COMMENT_OR_TEXT.sub(lambda found: found[0] if found[0].startswith('"') else " ", definitions)
+    return _ANNOTATION.sub(" ", uncommented)
