@@ -5,7 +5,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from pipeline.ingest import CatalogueChannel, survey_channels
-from pipeline.logs.reader import Health, open_log, utc
+from pipeline.logs.parts import recorded_parts
+from pipeline.logs.reader import Health, open_log, open_parts, utc
 from pipeline.mapping import suggest_mapping
 
 _MAX_CHANNELS = 200
@@ -32,8 +33,9 @@ class LogDescription:
 
 
 def describe_log(path: Path | str) -> LogDescription:
-    """The description of the log at `path`; `InputError` where it is no MCAP."""
-    log = open_log(path)
+    """The description of the log at `path`, a file or the folder of a split recording; `InputError` where it is no MCAP."""
+    parts = recorded_parts(Path(path))
+    log = open_parts(parts) if parts else open_log(path)
     suggested = suggest_mapping(log.channels)
     return LogDescription(
         path=log.path,

@@ -62,3 +62,11 @@ def test_description_is_plain_data(tmp_path):
 def test_what_is_no_log_is_refused(tmp_path):
     with pytest.raises(InputError, match="not an MCAP"):
         describe_log(write(tmp_path, b"x" * 50))
+
+
+def test_folder_of_a_split_recording_is_one_log(tmp_path):
+    for name in ("bag_0.mcap", "bag_1.mcap"):
+        (tmp_path / name).write_bytes(recording())
+    (tmp_path / "metadata.yaml").write_text("relative_file_paths:\n  - bag_0.mcap\n  - bag_1.mcap\n")
+    described = describe_log(tmp_path)
+    assert [channel.num_messages for channel in described.channels] == [80, 80, 80]
