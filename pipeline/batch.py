@@ -23,7 +23,7 @@ from pipeline.manifest import StageResult
 from pipeline.missions import find_missions
 from pipeline.progress import Progress, Told
 from pipeline.report import ReportConfig, report
-from pipeline.storage import shown
+from pipeline.urls import shown
 
 STAGES = ("ingest", "extract", "infer", "export", "report")
 

@@ -15,7 +15,7 @@ from pipeline.logs.health import utc
 from pipeline.logs.reader import MissionLog, open_parts
 from pipeline.missions import find_missions
 from pipeline.progress import Progress
-from pipeline.storage import is_url
+from pipeline.urls import is_url
 
 Verdict = Literal["sound", "faulty", "partial", "unusable"]
 _MEANING: Mapping[Verdict, str] = {

@@ -12,7 +12,8 @@ from typing import Final
 
 from cadence.errors import InputError, UsageError
 from pipeline.logs.parts import group_parts, mission_name
-from pipeline.storage import StoredObject, find_objects, is_url, shown, url_name
+from pipeline.storage import StoredObject, find_objects
+from pipeline.urls import is_url, shown, url_name
 
 _OWN_ENDINGS: Final = (".cadence.mcap", ".combined.mcap")
 

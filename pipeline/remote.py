@@ -25,18 +25,9 @@ from pipeline.locks import locked
 from pipeline.manifest import StageResult, hash_file, manifest_path, read_manifest, write_atomic
 from pipeline.progress import Progress
 from pipeline.provenance import versions
-from pipeline.storage import (
-    MissingObject,
-    StoredObject,
-    describe,
-    fetch,
-    is_url,
-    list_folder,
-    read_bytes,
-    remove,
-    shown,
-    write_file,
-)  # fmt: skip
+from pipeline.storage import StoredObject, describe, fetch, list_folder, read_bytes, remove, write_file
+from pipeline.stores import MissingObject
+from pipeline.urls import is_url, shown
 
 RECEIPT_NAME: Final = "run.manifest.json"
 SOURCE_NAME: Final = ".source"

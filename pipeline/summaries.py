@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from pipeline.manifest import StageResult
-from pipeline.storage import shown
+from pipeline.urls import shown
 
 if TYPE_CHECKING:
     from pipeline.batch import LogOutcome

@@ -16,7 +16,7 @@ from typing import Any, Final
 from cadence.errors import ConfigError, DeviceError
 from pipeline.batch import LogOutcome, LogTask, RunTask, Watch
 from pipeline.progress import RelayedProgress, Told
-from pipeline.storage import is_url
+from pipeline.urls import is_url
 
 NUM_ATTEMPTS: Final = 3
 """How many workers a task may cost before it counts as failed."""

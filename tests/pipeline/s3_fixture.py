@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from pipeline import storage
+from pipeline import stores
 
 ENVIRONMENT = {"AWS_ACCESS_KEY_ID": "user", "AWS_SECRET_ACCESS_KEY": "open-sesame", "AWS_DEFAULT_REGION": "us-east-1"}
 
@@ -92,7 +92,7 @@ def s3(s3_server: S3Server, monkeypatch: pytest.MonkeyPatch) -> S3Server:
     """The server with nothing in it but an empty bucket `sea`, and this process with credentials for it."""
     for name, value in {**ENVIRONMENT, "AWS_ENDPOINT_URL": s3_server.url}.items():
         monkeypatch.setenv(name, value)
-    monkeypatch.setattr(storage, "_FIRST_PAUSE_S", 0.01)
+    monkeypatch.setattr(stores, "FIRST_PAUSE_S", 0.01)
     s3_server.faults.clear()
     for method, path in (("POST", "moto-api/reset"), ("PUT", "sea")):
         request = urllib.request.Request(f"{s3_server.url}/{path}", method=method)

@@ -9,21 +9,11 @@ from functools import partial
 import pytest
 
 from cadence.errors import ConfigError, DeviceError, InputError
-from pipeline import storage
+from pipeline import storage, stores
 from pipeline.progress import Progress
-from pipeline.storage import (
-    MissingObject,
-    describe,
-    fetch,
-    find_objects,
-    is_url,
-    list_folder,
-    read_bytes,
-    remove,
-    shown,
-    url_name,
-    write_file,
-)  # fmt: skip
+from pipeline.storage import describe, fetch, find_objects, list_folder, read_bytes, remove, write_file
+from pipeline.stores import MissingObject
+from pipeline.urls import is_url, shown, url_name
 
 pytest_plugins = ("s3_fixture",)
 QUIET = Progress(quiet=True)
@@ -93,18 +83,18 @@ def test_a_fetch_goes_on_where_it_was_cut(s3, tmp_path, monkeypatch):
     content = os.urandom(4500)
     put(tmp_path, "s3://sea/log.mcap", content)
     found = describe("s3://sea/log.mcap")
-    original = storage._attempt
+    original = storage.attempt
 
     def cut(action, url, is_output=False, num_attempts=5):
         if s3.count("GET", "log.mcap") == 3:
             raise KeyboardInterrupt
         return original(action, url, is_output, num_attempts)
 
-    monkeypatch.setattr(storage, "_attempt", cut)
+    monkeypatch.setattr(storage, "attempt", cut)
     with pytest.raises(KeyboardInterrupt):
         fetch(found, tmp_path, QUIET)
     assert not (tmp_path / "log.mcap").exists()  # never half a log under its name
-    monkeypatch.setattr(storage, "_attempt", original)
+    monkeypatch.setattr(storage, "attempt", original)
     s3.requests.clear()
     assert fetch(found, tmp_path, QUIET).read_bytes() == content
     assert s3.count("GET", "log.mcap") == 2  # 4500 bytes are five blocks, three were there
@@ -147,8 +137,8 @@ def test_a_server_that_always_fails_is_given_up(s3, tmp_path):
 
 def test_a_server_that_is_silent_is_given_up(s3, tmp_path, monkeypatch):
     put(tmp_path, "s3://sea/a")
-    monkeypatch.setattr(storage, "READ_TIMEOUT_S", 0.2)
-    monkeypatch.setattr(storage, "NUM_ATTEMPTS", 2)
+    monkeypatch.setattr(stores, "READ_TIMEOUT_S", 0.2)
+    monkeypatch.setattr(stores, "NUM_ATTEMPTS", 2)
     s3.fail("GET", "a", count=2, pause_s=1.0)
     with pytest.raises(DeviceError, match="does not answer"):
         read_bytes("s3://sea/a")
@@ -275,7 +265,7 @@ def test_a_web_server_without_ranges(web, tmp_path, monkeypatch):
 def test_a_web_server_with_ranges(s3, tmp_path, monkeypatch):
     monkeypatch.setattr(storage, "BLOCK_BYTES", 1000)
     put(tmp_path, "s3://sea/a.mcap", os.urandom(2500))
-    signed = storage._open("s3://sea/a.mcap")[0].sign("sea/a.mcap", expiration=100)
+    signed = stores.open_store("s3://sea/a.mcap")[0].sign("sea/a.mcap", expiration=100)
     found = describe(signed)
     assert "Signature" in signed and shown(signed) == f"{s3.url}/sea/a.mcap"
     s3.requests.clear()
