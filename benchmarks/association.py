@@ -4,7 +4,7 @@ Held-out episodes of the world `rendezvous` as one stream of detections, and rea
 of this project (its likeliest way, and the mean of its ways, each agent's detections smoothed by the bank) beside two trackers
 of Stone Soup: global nearest neighbour and joint probabilistic data association, both with Rauch-Tung-Striebel smoothing. The
 trackers' settings are searched by the score that is reported, so in their favour. Everything is retrospective: all detections
-of a log are known.
+of a log are known. One JSON file per log and per search lies in the work folder: a killed run goes on where it was.
 
     python benchmarks/association.py --publish docs/benchmarks
 """
@@ -12,11 +12,12 @@ of a log are known.
 import argparse
 import datetime
 import itertools
+import json
 import sys
 import tempfile
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from multiprocessing import get_context
 from pathlib import Path
 
@@ -33,6 +34,7 @@ from cadence.types import Detections, WindowBatch
 from cadence.worlds.rendezvous import RendezvousConfig, simulate_rendezvous_batch
 
 DATA = Path(__file__).resolve().parents[1].parent / "shared" / "data"
+WORK = Path("out/benchmarks/association")
 SHIPS = "maritime/solent_ais_unknown.mcap"
 ORDER = 2.0
 NUM_WAYS = 6
@@ -350,24 +352,22 @@ def _rows_of(origin: Integers) -> list[Integers]:
     return [np.flatnonzero(origin == agent) for agent in np.unique(origin)]
 
 
-def calibration(estimates: Sequence[Estimate], logs: Sequence[Log]) -> list[str]:
-    """How often P(detection -> agent) comes true, in five bins; agents are named after the likeliest way."""
-    said, came = [], []
-    for estimate, log in zip(estimates, logs, strict=True):
-        table = np.zeros((estimate.probability.shape[1] - 1, int(log.origin.max()) + 1))
-        for agent in range(table.shape[1]):
-            table[:, agent] = estimate.probability[log.origin == agent, :-1].sum(0)
-        for row, column in zip(*linear_sum_assignment(-table), strict=True):
-            said.append(estimate.probability[:, row])
-            came.append(log.origin == column)
-    chance, hit = np.concatenate(said), np.concatenate(came)
+def told(probability: Floats, origin: Integers) -> tuple[Floats, NDArray[np.bool_]]:
+    """P(detection -> agent) of every detection and agent, flat, and whether it came true; names as they overlap most."""
+    table = np.stack([probability[origin == agent, :-1].sum(0) for agent in range(int(origin.max()) + 1)], axis=1)
+    pairs = list(zip(*linear_sum_assignment(-table), strict=True))
+    said = np.concatenate([probability[:, row] for row, _ in pairs])
+    return said, np.concatenate([origin == column for _, column in pairs])
+
+
+def calibration(said: Floats, came: Floats) -> list[str]:
+    """How often what is said comes true, in five bins."""
     lines = []
     for low, high in itertools.pairwise((0.0, 0.1, 0.5, 0.9, 0.99, 1.0 + 1e-9)):
-        inside = (chance >= low) & (chance < high)
+        inside = (said >= low) & (said < high)
         if inside.any():
-            lines.append(
-                f"| {low:g} to {min(high, 1.0):g} | {inside.sum()} | {chance[inside].mean():.3f} | {hit[inside].mean():.3f} |"
-            )
+            means = f"{said[inside].mean():.3f} | {came[inside].mean():.3f}"
+            lines.append(f"| {low:g} to {min(high, 1.0):g} | {inside.sum()} | {means} |")
     return lines
 
 
@@ -383,7 +383,7 @@ class Case:
 
 def rendezvous_case(number: int) -> Case:
     """Held-out episodes; settings are searched on two others."""
-    options = [Settings(q, gate, 1e-10, 1e9) for q in (3e-3, 1e-2, 1e-1) for gate in (4.0, 8.0)]
+    options = [Settings(q, gate, 1e-10, 3600.0) for q in (3e-3, 1e-2, 1e-1) for gate in (4.0, 8.0)]
     return Case("rendezvous", rendezvous_logs(HELD_OUT_SEED, number), rendezvous_logs(TUNING_SEED, 2), tuple(options))
 
 
@@ -400,46 +400,71 @@ def ships_case() -> Case:
     return Case("ships", [log], [quarter], tuple(options))
 
 
-def estimated(job: tuple[Log, dict[str, Settings]]) -> dict[str, tuple[Estimate, Scores]]:
-    """Every estimator on one log; a further one is one more function from a log to named estimates."""
-    log, settings = job
-    estimators: list[Estimator] = [known, ours, *(rival(kind, chosen) for kind, chosen in settings.items())]
-    found = {name: estimate for estimator in estimators for name, estimate in estimator(log).items()}
-    return {name: (estimate, scores_of(estimate, log)) for name, estimate in found.items()}
+def searched_for(job: tuple[Path, str, Case]) -> Settings:
+    """The settings of one tracker for a case, from the work folder if they are there."""
+    file, kind, case = job
+    if not file.is_file():
+        _keep(file, asdict(searched(kind, case.tuning, case.options)))
+    return Settings(**json.loads(file.read_text(encoding="utf-8")))
+
+
+def estimated(job: tuple[Path, Log, dict[str, Settings]]) -> dict[str, dict]:
+    """Scores of every estimator on one log, from the work folder if they are there.
+
+    A further estimator is one more function from a log to named estimates.
+    """
+    file, log, settings = job
+    if not file.is_file():
+        estimators: list[Estimator] = [known, ours, *(rival(kind, chosen) for kind, chosen in settings.items())]
+        found = {name: estimate for estimator in estimators for name, estimate in estimator(log).items()}
+        rows = {name: asdict(scores_of(estimate, log)) for name, estimate in found.items()}
+        for name, estimate in found.items():
+            if estimate.probability is not None:
+                rows[name]["said"], rows[name]["came"] = told(estimate.probability, log.origin)
+        _keep(file, {name: {key: np.asarray(value).tolist() for key, value in row.items()} for name, row in rows.items()})
+    return json.loads(file.read_text(encoding="utf-8"))
+
+
+def _keep(file: Path, value: object) -> None:
+    from pipeline.manifest import write_atomic
+
+    file.parent.mkdir(parents=True, exist_ok=True)
+    write_atomic(file, json.dumps(value))
 
 
 def table(case: Case, jobs: int) -> list[str]:
     """The section of one case."""
+    folder = WORK / case.name
     with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
-        wanted = [pool.submit(searched, kind, case.tuning, case.options) for kind in KINDS]
-        settings = {kind: future.result() for kind, future in zip(KINDS, wanted, strict=True)}
-        results = list(pool.map(estimated, [(log, settings) for log in case.logs]))
+        settings = dict(zip(KINDS, pool.map(searched_for, [(folder / f"{k}.json", k, case) for k in KINDS]), strict=True))
+        work = [(folder / f"log{index}.json", log, settings) for index, log in enumerate(case.logs)]
+        results = list(pool.map(estimated, work))
     lines = [ROW_HEAD]
     for name in results[0]:
-        scores = [result[name][1] for result in results]
-        interval = _interval(scores)
-        parts = [
-            float(np.mean([np.sqrt(part.mean()) for part in column]))
-            for column in zip(*((s.localisation, s.missed, s.false) for s in scores), strict=True)
-        ]
-        right, linked = (float(np.mean(column)) for column in zip(*((s.right, s.linked) for s in scores), strict=True))
-        cells = [f"{interval.value:.1f} ({interval.low:.1f} to {interval.high:.1f})", *(f"{part:.0f}" for part in parts)]
-        cells += ["-" if np.isnan(value) else f"{100 * value:.1f}" for value in (right, linked)]
+        rows = [{key: np.array(value, dtype=float) for key, value in result[name].items()} for result in results]
+        interval = _interval([row["gospa"] for row in rows])
+        cells = [f"{interval.value:.1f} ({interval.low:.1f} to {interval.high:.1f})"]
+        cells += [f"{np.mean([np.sqrt(row[part].mean()) for row in rows]):.0f}" for part in PARTS]
+        shares = [100.0 * np.mean([row[key] for row in rows]) for key in ("right", "linked")]
+        cells += ["-" if np.isnan(share) else f"{share:.1f}" for share in shares]
         lines.append(f"| {name} | " + " | ".join(cells) + " |")
     chosen = "; ".join(f"{kind}: {setting}" for kind, setting in settings.items())
-    first = next(name for name in results[0] if results[0][name][0].probability is not None)
+    both = [
+        [np.array(row[key], dtype=float) for result in results for row in result.values() if key in row] for key in CALIBRATED
+    ]
     lines += ["", f"Settings that the search chose: {chosen}.", "", CALIBRATION_HEAD]
-    return lines + calibration([result[first][0] for result in results], case.logs)
+    return lines + calibration(said, came)
 
 
-def _interval(scores: Sequence[Scores]) -> Interval:
+def _interval(gospas: Sequence[Floats]) -> Interval:
     """Mean GOSPA and its interval: over episodes, or over blocks of ten minutes where there is one log only."""
-    values = np.concatenate([score.gospa for score in scores])
-    log = np.repeat(np.arange(len(scores)), [len(score.gospa) for score in scores])
-    groups = log if len(scores) > 1 else np.arange(len(values)) // 10
+    values = np.concatenate(gospas)
+    log = np.repeat(np.arange(len(gospas)), [len(gospa_m) for gospa_m in gospas])
+    groups = log if len(gospas) > 1 else np.arange(len(values)) // 10
     return bootstrap_mean(values, groups, np.random.default_rng(0))
 
 
+PARTS = ("localisation", "missed", "false")
 KINDS = ("GNN", "JPDA")
 ROW_HEAD = """| estimator | GOSPA, m (95 %) | localisation | missed | false | labels right, % | links right, % |
 |---|---|---|---|---|---|---|"""

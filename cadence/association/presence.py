@@ -14,7 +14,7 @@ from cadence.association.tracks import Tracks
 
 Floats = NDArray[np.float64]
 
-_PRIOR_COUNT = 2.0
+_PRIOR_COUNT = 10.0
 """How many detections' worth of evidence the stream's rate holds against an agent's own."""
 
 
