@@ -89,8 +89,8 @@ HEAD = """# Do local workers and Ray give the same hypotheses, and what does Ray
     python benchmarks/batch_engines.py --num-logs {num_logs} --workers {workers} --checkpoint {checkpoint}
 
 {num_logs} simulated missions of ten minutes through `cadence run`, once with `--engine local` and once with `--engine ray` on
-the same machine ({cpus} hyperthreads), {workers} workers each, one thread a worker. Every file of every mission is hashed. The wall
-times include the start of the workers, and for Ray that of Ray itself. Checkpoint: {checkpoint}. Versions: {versions}.
+the same machine ({cpus} hyperthreads), {workers} workers each, one thread a worker. Every file of every mission is hashed. The
+wall times include the start of the workers, and for Ray that of Ray itself. Checkpoint: {checkpoint}. Versions: {versions}.
 
 | what | value |
 |---|---|

@@ -23,7 +23,8 @@ CONFIG = stage_config(RunConfig, None, None, ["infer.checkpoint=none", "infer.nu
 @pytest.fixture(scope="module")
 def cluster():
     """One Ray for all tests."""
-    ray = pytest.importorskip("ray", reason="needs the extra ray")
+    pytest.importorskip("ray", reason="needs the extra ray")
+    ray = module._ray()
     with module._connected(ray, 2):
         yield ray
 
