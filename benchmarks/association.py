@@ -449,9 +449,8 @@ def table(case: Case, jobs: int) -> list[str]:
         cells += ["-" if np.isnan(share) else f"{share:.1f}" for share in shares]
         lines.append(f"| {name} | " + " | ".join(cells) + " |")
     chosen = "; ".join(f"{kind}: {setting}" for kind, setting in settings.items())
-    both = [
-        [np.array(row[key], dtype=float) for result in results for row in result.values() if key in row] for key in CALIBRATED
-    ]
+    rows = [row for result in results for row in result.values() if "said" in row]
+    said, came = (np.concatenate([np.array(row[key], dtype=float) for row in rows]) for key in ("said", "came"))
     lines += ["", f"Settings that the search chose: {chosen}.", "", CALIBRATION_HEAD]
     return lines + calibration(said, came)
 

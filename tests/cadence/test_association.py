@@ -54,17 +54,15 @@ def test_agents_that_cross_keep_their_ways():
 
 def test_what_cannot_be_known_is_said_to_be_unknown():
     """Two agents wait at one place together and part: half of the belief is in either exchange of their names."""
-    time = 30.0 * np.arange(48)
-    origin = np.arange(48) % 2
-    way = np.where(time < 480.0, time - 480.0, np.where(time < 960.0, 0.0, time - 960.0)) * 4.0
+    time = 30.0 * np.arange(38)
+    origin = np.arange(38) % 2
+    way = np.where(time < 480.0, time - 480.0, np.where(time < 660.0, 0.0, time - 660.0)) * 4.0
     place = np.stack([way, np.where(origin == 0, 1.0, -1.0) * np.abs(way) * 0.5], axis=1)
     (found,) = read(time, place + np.random.default_rng(1).normal(0.0, 1.0, place.shape))
-    late = found.label[:, -8:]
-    early = found.label[:, :8]
-    is_straight = (late[:, 0] == early[:, 0]).astype(float)
+    early, late = found.label[:, :8], found.label[:, -8:]
     assert same_partition(late[0], origin[-8:])
     assert same_partition(early[0], origin[:8])
-    assert 0.2 < found.weight @ is_straight < 0.8
+    assert 0.1 < found.weight @ (late[:, 0] == early[:, 0]) < 0.9
 
 
 def test_nothing_after_an_origin_matters():
@@ -116,18 +114,6 @@ def test_agents_come_and_go_where_their_number_is_unknown():
     assert set(early.label[0].tolist()) == {0}
     assert same_partition(late.label[0], is_second)
     assert late.num_agents == early.num_agents
-
-
-def test_nobody_exceeds_the_speed_limit():
-    time = 60.0 * np.arange(12)
-    place = np.stack([300.0 * np.arange(12), np.zeros(12)], axis=1)
-    place[6] += 900.0  # off the way by as much as three steps
-    only = AssociationConfig(num_agents=1)
-    (free,) = read(time, place, only)
-    assert agent_probability(free)[6, 0] > 0
-    (bound,) = read(time, place, only, max_speed_mps=6.0)
-    is_both = (bound.label[:, [5, 6]] == 0).all(1) | (bound.label[:, [6, 7]] == 0).all(1)
-    assert not is_both.any()
 
 
 @pytest.mark.parametrize("number", [0, 1])

@@ -1,5 +1,6 @@
 """The filter against what can be computed without it: all ways to read a short stream, and the bank's Kalman filter."""
 
+import dataclasses
 import itertools
 
 import numpy as np
@@ -73,6 +74,14 @@ def test_few_particles_are_right_on_average():
         found.append(np.exp(last.log_evidence - exact.log_evidence) * (last.weight @ (last.label == 0)))
     error = np.std(found, axis=0) / np.sqrt(len(found))
     assert (np.abs(np.mean(found, axis=0) - wanted) < 4.5 * error + 1e-3).all()
+
+
+def test_nobody_exceeds_the_speed_limit():
+    tracks = updated(Tracks.none(2), TWO, Detection(0.0, np.zeros(2), np.eye(2)), np.array([0]))
+    far = Detection(60.0, np.array([0.0, 400.0]), np.eye(2))
+    for limit, is_possible in ((None, True), (7.0, True), (6.0, False)):
+        log_density = continuations(tracks, dataclasses.replace(habits(), max_speed_mps=limit), far, 0.0)[0]
+        assert np.isfinite(log_density).tolist() == [is_possible, True, True]
 
 
 def test_motion_is_the_banks_ornstein_uhlenbeck():
