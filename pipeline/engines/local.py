@@ -33,7 +33,7 @@ def run_in_processes(
     workers: dict[Connection, _Worker] = {}
     # Forked from a process that has imported everything and runs no threads: workers start at once and share that memory.
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["pipeline.batch"])
+    context.set_forkserver_preload(["pipeline.run"])
     try:
         while waiting or workers:
             while waiting and len(workers) < num_workers:

@@ -1,13 +1,17 @@
 """Tiny batches, run in processes that can be killed: they are forked from one that has imported everything already."""
 
 import multiprocessing
+import os
+import signal
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 
 from logs_fixture import straight_line, write_log
 
 import cli
+from pipeline.batch import LogOutcome, LogTask
 from pipeline.manifest import hash_file
+from pipeline.progress import Progress
 
 SETTINGS = {
     "infer.checkpoint": "none", "infer.num_hypotheses": 2, "infer.grid.stride_steps": 64, "infer.grid.history_steps": 8,
@@ -16,7 +20,7 @@ SETTINGS = {
 FLAGS = [word for name, value in SETTINGS.items() for word in ("--set", f"{name}={value}")] + ["--quiet"]
 
 _context = multiprocessing.get_context("forkserver")
-_context.set_forkserver_preload(["pipeline.run", "batch_fixture"])
+_context.set_forkserver_preload(["pipeline.run"])
 
 
 def write_tiny_logs(folder: Path, count: int) -> Path:
@@ -49,3 +53,13 @@ def results_of(out: Path) -> dict[str, str]:
 def hidden_in(out: Path) -> list[str]:
     """What begins with a dot, at any depth."""
     return sorted(str(path.relative_to(out)) for path in out.rglob(".*"))
+
+
+def outcome_or_death(task: LogTask, progress: Progress) -> LogOutcome:
+    """Stands in for `run_task`: the log's name says what becomes of the worker."""
+    progress.note(f"at work as {os.getpid()}")
+    if task.parts[0] == "killed":
+        os.kill(os.getpid(), signal.SIGKILL)
+    if task.parts[0] == "exits":
+        os._exit(9)
+    return LogOutcome(task, message="" if task.parts[0] != "bad" else "bad: no", exit_code=3 * (task.parts[0] == "bad"))

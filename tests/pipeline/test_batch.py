@@ -2,16 +2,15 @@
 
 import functools
 import os
-import signal
 import threading
 import time
 from pathlib import Path
 
 import pytest
-from batch_fixture import SETTINGS, hidden_in, results_of, write_tiny_logs
+from batch_fixture import SETTINGS, hidden_in, outcome_or_death, results_of, write_tiny_logs
 
 from cadence.errors import InputError
-from pipeline.batch import LogOutcome, LogTask, RunConfig, exit_code, run_task, run_tasks
+from pipeline.batch import LogTask, RunConfig, exit_code, run_task, run_tasks
 from pipeline.config import stage_config
 from pipeline.engines.local import run_in_processes, run_in_sequence
 from pipeline.locks import clear_abandoned, locked
@@ -75,16 +74,6 @@ def test_parts_of_a_split_recording_are_one_mission(tree):
     (mission,) = find_missions([str(tree / "bag")], "out")
     assert [Path(part).name for part in mission.parts] == ["bag_0.mcap", "bag_1.mcap", "bag_10.mcap"]
     assert (mission.directory, mission.size_bytes) == ("out/bag", 30)
-
-
-def outcome_or_death(task: LogTask, progress: Progress) -> LogOutcome:
-    """Stands in for `run_task`: the log's name says what becomes of the worker."""
-    progress.note(f"at work as {os.getpid()}")
-    if task.parts[0] == "killed":
-        os.kill(os.getpid(), signal.SIGKILL)
-    if task.parts[0] == "exits":
-        os._exit(9)
-    return LogOutcome(task, message="" if task.parts[0] != "bad" else "bad: no", exit_code=3 * (task.parts[0] == "bad"))
 
 
 def tasks_named(*names: str) -> list[LogTask]:
