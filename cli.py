@@ -39,13 +39,13 @@ app = typer.Typer(
 Log = Annotated[Path, typer.Argument(metavar="LOG", help="Mission log (MCAP).", show_default=False)]
 Logs = Annotated[
     list[str],
-    typer.Argument(metavar="LOG", help="Mission logs (MCAP), folders or patterns of them.", show_default=False),
+    typer.Argument(metavar="LOG", help="Mission logs (MCAP), folders, patterns or URLs of them.", show_default=False),
 ]
 Mission = Annotated[
     Path, typer.Argument(metavar="MISSION", help="Mission directory, as written by ingest or run.", show_default=False)
 ]
 Out = Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the results; made where it is absent.")]
-RunOut = Annotated[str, typer.Option("--out", metavar="DIR", help="Folder for the results; made where it is absent.")]
+RunOut = Annotated[str, typer.Option("--out", metavar="DIR", help="Folder or URL for the results.")]
 Workers = Annotated[
     int | None, typer.Option(metavar="N", help="Processes; 0 works in this one; default: as cores and memory allow.")
 ]
@@ -132,6 +132,7 @@ def run(
       cadence run flight.mcap --out results
       cadence run logs --out results --workers 4 --config ships.toml
       cadence run 'logs/2026-*/*.mcap' --out results --report night.json --quiet
+      cadence run s3://fleet/2026-11 --out s3://fleet/tracks --engine ray
       cadence run flight.mcap --out results --set infer.num_hypotheses=50 --seed 7
     """
     from pipeline.batch import RunConfig, exit_code
