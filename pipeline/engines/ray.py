@@ -22,6 +22,7 @@ NUM_ATTEMPTS: Final = 3
 """How many workers a task may cost before it counts as failed."""
 
 _REASON_LENGTH: Final = 120
+_CANNOT_START: Final = "error raised in its creation task"  # as Ray says it; there is no kind of failure for it
 _SETTINGS: Final = {
     "RAY_USAGE_STATS_ENABLED": "0",  # nothing is sent to its makers
     "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",  # what it will do anyway in future, without saying so each time
@@ -63,6 +64,11 @@ def _run(ray: Any, crew: "_Crew", tasks: Sequence[LogTask], watch: Watch, limit:
             except ray.exceptions.RayTaskError:
                 raise  # a defect: a task keeps its failures in its outcome
             except (ray.exceptions.RayError, StopIteration) as error:
+                if _CANNOT_START in str(error):
+                    raise DeviceError(
+                        f"--engine ray: workers cannot start ({_reason(error)}); "
+                        "install the same versions of CADENCE and its libraries on every machine"
+                    ) from error
                 del busy[stream]
                 crew.lose(job)
                 if job.attempt < NUM_ATTEMPTS:

@@ -25,8 +25,11 @@ def cluster():
     """One Ray for all tests."""
     pytest.importorskip("ray", reason="needs the extra ray")
     ray = module._ray()
-    with module._connected(ray, 2):
-        yield ray
+    with pytest.MonkeyPatch.context() as patch:
+        here = Path(__file__).parent
+        patch.setenv("PYTHONPATH", os.pathsep.join(map(str, (here, here.parent))))  # workers import this module for its tasks
+        with module._connected(ray, 2):
+            yield ray
 
 
 def die_first(task, progress):
