@@ -19,7 +19,7 @@ from pipeline.logs.health import utc as utc
 from pipeline.logs.indexed import plan_by_index
 from pipeline.logs.parts import missing_parts, mission_name
 from pipeline.logs.plan import Plan
-from pipeline.logs.records import MAGIC, MAX_TIME_NS, parse_metadata
+from pipeline.logs.records import MAGIC, MAX_TIME_NS, TEXT_MAGIC, parse_metadata
 from pipeline.logs.salvage import scan_log
 from pipeline.logs.timeline import Selection, Source, Timeline, read_span, reading
 
@@ -31,6 +31,7 @@ _FOREIGN_MAGIC = {
     b"\x1f\x8b": "compressed with gzip; unpack it first",
     b"\x28\xb5\x2f\xfd": "compressed with zstd; unpack it first",
     b"PK\x03\x04": "a ZIP archive; unpack it first",
+    MAGIC[:5]: "an MCAP of another version, or one whose line ends a copy has changed; copy it in binary mode",
 }
 
 
@@ -224,7 +225,7 @@ def _check_magic(path: Path) -> int:
         raise InputError(f"{path}: cannot be read ({error}); check the permissions") from error
     if size == 0:
         raise InputError(f"{path}: is empty; nothing was recorded, or the copy failed")
-    if head != MAGIC:
+    if head != MAGIC and not head.startswith(TEXT_MAGIC):
         kind = next((text for magic, text in _FOREIGN_MAGIC.items() if head.startswith(magic)), "something else")
         raise InputError(f"{path}: is not an MCAP file but {kind}")
     return size

@@ -23,6 +23,8 @@ from mcap.exceptions import EndOfFile, McapError
 from mcap.opcode import Opcode
 
 MAGIC: Final = b"\x89MCAP0\r\n"
+TEXT_MAGIC: Final = b"\x89MCAP0\n"
+"""How a file begins that was copied as text: every CR LF in it became LF."""
 HEAD: Final = struct.Struct("<BQ")
 """Opcode and length in front of every record."""
 MESSAGE_HEAD: Final = struct.Struct("<HIQQ")

@@ -26,6 +26,7 @@ from pipeline.logs.records import (
     MAX_CHUNK_BYTES,
     MAX_TIME_NS,
     MESSAGE_HEAD,
+    TEXT_MAGIC,
     DamagedRecord,
     is_chunk_head,
     library_of,
@@ -79,9 +80,9 @@ class _Scanner:
 
     def run(self) -> None:
         """Fill the plan."""
-        if self._states_checksum():
-            self.crc = zlib.crc32(self._read(0, len(MAGIC)))
-        self.position = len(MAGIC)
+        self.position = self._magic_length()
+        if self.position == len(MAGIC) and self._states_checksum():
+            self.crc = zlib.crc32(MAGIC)
         while self.position < self.limit and not self.plan.reached_end:
             try:
                 self._record()
@@ -94,6 +95,15 @@ class _Scanner:
         if self.on_bytes is not None:
             self.on_bytes(self.size - self.reported)
         self._cross_check()
+
+    def _magic_length(self) -> int:
+        """Where the first record begins."""
+        self.file.seek(0)
+        if self.file.read(len(MAGIC)) == MAGIC:
+            return len(MAGIC)
+        words = "every CR LF in it became LF, which breaks what held one; copy it in binary mode"
+        self.plan.doubts.append(f"The file was copied as text: {words}.")
+        return len(TEXT_MAGIC)
 
     def _read(self, offset: int, length: int) -> bytes:
         self.file.seek(offset)

@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 from encoded_logs import CONTAINERS, encoded_log
-from recorder_fixture import carried, content, reference
+from recorder_fixture import FORMS, carried, content, recording, reference
 
 from cadence.errors import InputError
 from pipeline.logs.decode import Decoder, UndecodableChannel, UndecodableMessage, decoder_for
@@ -147,6 +147,35 @@ def test_real_logs_cut(real: Whole, scratch: Path) -> None:
 
 def test_real_logs_changed(real: Whole, scratch: Path) -> None:
     change_everywhere(scratch, real)
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_a_log_that_was_copied_as_text_is_read_where_it_is_whole(form: str, scratch: Path) -> None:
+    whole = recording(num_messages=3000, **FORMS[form])
+    assert whole.count(b"\r\n") > 2  # the magic at both ends, and some by chance
+    scratch.write_bytes(whole.replace(b"\r\n", b"\n"))
+    log = open_log(scratch)
+    found, wanted = content(log), reference(whole)
+    assert not log.health.is_complete and any("copied as text" in problem for problem in log.health.problems)
+    assert len(found) > 0.7 * len(wanted)
+    # Outside chunks nothing tells that a message is one byte short: it takes one of the next record.
+    num_wrong = (Counter(found) - Counter(wanted)).total()
+    assert num_wrong <= (whole.count(b"\r\n") if form == "unchunked" else 0)
+
+
+@pytest.mark.parametrize("num_bytes", range(13))
+def test_the_mere_beginning_of_a_log_copied_as_text(num_bytes: int, scratch: Path) -> None:
+    scratch.write_bytes(recording().replace(b"\r\n", b"\n")[:num_bytes])
+    try:
+        assert not open_log(scratch).health.is_complete
+    except InputError as error:
+        assert num_bytes < 7 and "\n" not in str(error)
+
+
+def test_other_line_ends_are_named(scratch: Path) -> None:
+    scratch.write_bytes(recording().replace(b"\n", b"\r\n"))
+    with pytest.raises(InputError, match="binary mode"):
+        open_log(scratch)
 
 
 @pytest.mark.parametrize("encoding", CONTAINERS)
