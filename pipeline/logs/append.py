@@ -5,8 +5,6 @@ source in time; readers that follow the index, and ours, put the messages of bot
 """
 
 import os
-import zlib
-from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import BinaryIO, Final
 
@@ -18,7 +16,7 @@ from pipeline.logs.records import DamagedRecord
 from pipeline.logs.source_index import SourceIndex, read_index
 from pipeline.progress import Progress
 
-_BLOCK_BYTES: Final = 2**21
+_BLOCK_BYTES: Final = 2**20
 
 
 def write_combined(source: Path, side: Path, target: Path, packing: Packing, progress: Progress) -> None:
@@ -26,7 +24,8 @@ def write_combined(source: Path, side: Path, target: Path, packing: Packing, pro
 
     Schemas and channels of `side` get ids above those of `source`. Memory is bounded by a chunk of either; `target` appears
     when it is complete. Neither input is touched.
-    Raises `InputError` where the source is damaged: a combined file must not hold less than its source.
+    Raises `InputError` where the source's records are damaged: a combined file must not hold less than its source. Chunks
+    keep their checksums and are not unpacked: damage inside stays as visible as it was (and the export stage looks for it).
     """
     added = open_log(side)
     if not added.health.is_complete:
@@ -35,8 +34,9 @@ def write_combined(source: Path, side: Path, target: Path, packing: Packing, pro
     try:
         with source.open("rb") as source_file, draft.open("wb") as target_file:
             found = _read_index(source, source_file, added)
-            checksum = _copy(source, source_file, target_file, found, progress)
-            recorder = Recorder(target_file, packing, found.index, found.data_end, checksum)
+            _copy(source, source_file, target_file, found.data_end, progress)
+            # Continued from what the source states, and not computed: where its bytes were changed, the sum stays wrong.
+            recorder = Recorder(target_file, packing, found.index, found.data_end, found.checksum or None)
             _add(added, recorder, progress)
             recorder.finish()
         os.replace(draft, target)
@@ -63,28 +63,16 @@ def _damaged(source: Path, reason: str) -> InputError:
     return InputError(f"{source}: is damaged ({reason}) and cannot be combined; export without combined")
 
 
-def _copy(source: Path, source_file: BinaryIO, target: BinaryIO, found: SourceIndex, progress: Progress) -> int | None:
-    """Copy the source up to the end of its data; the checksum of that, None where the source has none to compare with."""
+def _copy(source: Path, source_file: BinaryIO, target: BinaryIO, num_bytes: int, progress: Progress) -> None:
     source_file.seek(0)
-    checksum, remaining = 0, found.data_end
-    with (
-        progress.bar(found.data_end, f"combine {source.name}", unit="B", scale=True) as bar,
-        ThreadPoolExecutor(max_workers=1) as beside,  # the checksum takes longer than the copy
-    ):
-        checked: Future[int] | None = None
-        while remaining:
-            block = source_file.read(min(_BLOCK_BYTES, remaining))
+    with progress.bar(num_bytes, f"combine {source.name}", unit="B", scale=True) as bar:
+        while num_bytes:
+            block = source_file.read(min(_BLOCK_BYTES, num_bytes))
             if not block:
                 raise _damaged(source, "it became shorter meanwhile")
-            checksum = checked.result() if checked else 0
-            checked = beside.submit(zlib.crc32, block, checksum) if found.checksum else None
             target.write(block)
-            remaining -= len(block)
+            num_bytes -= len(block)
             bar.update(len(block))
-        checksum = checked.result() if checked else 0
-    if found.checksum != checksum:
-        raise _damaged(source, "the checksum over all data does not match")
-    return checksum if found.checksum else None
 
 
 def _add(added: MissionLog, recorder: Recorder, progress: Progress) -> None:

@@ -272,18 +272,28 @@ def test_damaged_source_is_refused(tmp_path, keep):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["side.mcap", "source.mcap"]
 
 
-@pytest.mark.parametrize("enable_data_crcs", [True, False])
-def test_flipped_byte_in_a_chunk_is_refused_where_its_checksum_is_read(tmp_path, enable_data_crcs):
-    options = {"compression": CompressionType.NONE, "enable_data_crcs": enable_data_crcs}
-    if not enable_data_crcs:
-        options |= SOURCES["no summary"]
-    source = source_log(tmp_path / "source.mcap", **options)
+def test_flipped_byte_is_noticed_where_chunks_are_unpacked(tmp_path):
+    source = source_log(tmp_path / "source.mcap", compression=CompressionType.NONE, **SOURCES["no summary"])
     data = bytearray(source.read_bytes())
     data[data.index(b"int32 x") + 3] ^= 1
     source.write_bytes(data)
     with pytest.raises(InputError, match="damaged"):
         combine(tmp_path, source)
     assert not (tmp_path / "target.mcap").exists()
+
+
+@pytest.mark.parametrize("part", [b"int32 x", b"Erna"], ids=["in a chunk", "outside"])
+def test_flipped_byte_does_not_become_less_visible(tmp_path, part):
+    """Chunks are not unpacked; their checksums, and that over all data, go on to be wrong."""
+    source = source_log(tmp_path / "source.mcap", compression=CompressionType.NONE, enable_data_crcs=True)
+    data = bytearray(source.read_bytes())
+    data[data.index(part) + 3] ^= 1
+    source.write_bytes(data)
+    target = combine(tmp_path, source).read_bytes()
+    (checksum,) = struct.unpack_from("<I", target, data_end(target) + HEAD.size)
+    assert checksum not in (0, zlib.crc32(target[: data_end(target)]))
+    with (tmp_path / "target.mcap").open("rb") as file, pytest.raises(ValueError, match=r"(?i)crc"):
+        list(NonSeekingReader(file, validate_crcs=True).iter_messages())
 
 
 def test_message_without_its_channel_is_refused(tmp_path):

@@ -316,6 +316,18 @@ def test_log_that_was_damaged_when_it_was_ingested_is_not_combined(tmp_path):
     assert not (directory / "patrol.combined.mcap").exists()
 
 
+def test_recording_in_parts_is_not_combined(tmp_path):
+    directory = build_mission(tmp_path)
+    catalogue = json.loads((directory / "catalogue.json").read_text())
+    part = {"path": catalogue["path"], "sha256": catalogue["sha256"], "size_bytes": catalogue["size_bytes"]}
+    catalogue["parts"] = [part, part]
+    (directory / "catalogue.json").write_text(json.dumps(catalogue))
+    with pytest.raises(InputError, match="is one part of 2, which cannot be combined") as caught:
+        export(directory, ExportConfig(combined=True), QUIET)
+    assert "\n" not in str(caught.value)
+    assert not list(directory.glob("*.mcap"))
+
+
 def test_scenes_that_change_each_time_have_fewer_points():
     assert num_vertices(100, 120, ExportConfig()) == 15
     assert num_vertices(100, 1000, ExportConfig()) == 32
