@@ -58,7 +58,7 @@ def motion(modes: Modes, duration_s: Floats) -> Motion:
     return Motion(
         gain=modes.relaxation_s * forgotten,
         decay=1.0 - forgotten,
-        noise_pp=2.0 * variance * modes.relaxation_s**2 * np.where(x < 0.1, series, closed),
+        noise_pp=2.0 * variance * modes.relaxation_s**2 * np.where(x < 0.02, series, closed),
         noise_pv=variance * modes.relaxation_s * forgotten**2,
         noise_vv=-variance * np.expm1(-2.0 * x),
     )
