@@ -228,11 +228,11 @@ HEAD = """# How fast are logs read?
     python benchmarks/log_reading.py
 
 A mixed log as a robot records it: {num} messages of ten topics (ROS 2, CDR), {size_mb:.0f} MB, zstd; `{topic}` is
-`nav_msgs/Odometry`. Both sides read it in turns in one process, {repeats} times; the fastest run counts. *Theirs* is `mcap` with
-its defaults (index, no checksums) and `mcap-ros2-support`; *ours* checks the checksum of every chunk that it reads. Both give
-the same messages in the same order, which the script verifies by a hash. A log that was checked before (by `cadence ingest`) is
-planned by its index; the third row is the first opening, which also compares every byte with checksums, indexes and
-statistics. Wall time gains by a second processor, which unpacks the next chunk meanwhile.
+`nav_msgs/Odometry`. Both sides read it in turns in one process, {repeats} times; the fastest run counts. *Theirs* is `mcap`
+with its defaults (index, no checksums) and `mcap-ros2-support`; *ours* checks the checksum of every chunk that it reads.
+Both give the same messages in the same order, which the script verifies by a hash. A log that was checked before (by
+`cadence ingest`) is planned by its index; the third row is the first opening, which also compares every byte with checksums,
+indexes and statistics. Wall time gains by a second processor, which unpacks the next chunk meanwhile.
 
 Versions: {versions}.
 
