@@ -24,7 +24,8 @@ JOINT_METRICS = (
 joint_energy_score_m is that of all agents' tracks as one vector (root mean square over its known cells), joint_min_ade_m the
 error of the one joint hypothesis that is best for all; both over agents that are part of every hypothesis. gospa_m is the mean
 over the steps of GOSPA (order 2) between weighted mean positions and truth, and the others are what it is made of: the error of
-the assigned, how many agents were missed and how many are none.
+the assigned, how many agents were missed and how many are none (where the truth is silent about an agent, its estimate
+counts as neither).
 """
 _ORDER = 2.0
 _NUM_BLOCKS = 10
@@ -103,7 +104,9 @@ class JointScorer:
         is_future = windows.time_s > 0.5 * windows.step_s
         steps_of = {"past": ~is_future, "future": is_future, "final": torch.arange(windows.num_steps) == windows.num_steps - 1}
         for b, window in enumerate(index.tolist()):
-            known = self.is_known[window]
+            known, match = self.is_known[window], self.match[window]
+            # Where the truth is silent about an agent, nobody can say that its estimate is a false one.
+            is_there[b, match[match >= 0]] &= known[match >= 0]
             scores = torch.full((windows.num_steps, 4), torch.nan, dtype=torch.float64)
             for step in known.any(0).nonzero()[:, 0].tolist():
                 estimated = mean_m[b, is_there[b, :, step], step]

@@ -43,13 +43,19 @@ def standing(position_m: list[list[list[float]]], weight: list[float]) -> Hypoth
     return HypothesisSet(position, torch.tensor([weight], dtype=torch.float64), (("ok",) * position.shape[2],))
 
 
-def joint(found: HypothesisSet, truth_m: list[list[float]], match: list[int], is_counted: bool = True) -> dict[str, float]:
+def joint(
+    found: HypothesisSet,
+    truth_m: list[list[float]],
+    match: list[int],
+    is_counted: bool = True,
+    is_known: list[bool] | None = None,
+) -> dict[str, float]:
     """Scores of the future."""
     num_agents, num_true = found.position_m.shape[2], len(truth_m)
     truth = torch.tensor(truth_m, dtype=torch.float64)[None, :, None].expand(-1, -1, NUM_STEPS, -1)
     scorer = JointScorer(
         windows(num_agents), torch.full((1, num_agents), is_counted), windows(num_true), torch.tensor([match]), truth,
-        torch.ones(1, num_true, NUM_STEPS, dtype=torch.bool), 10.0,
+        torch.tensor([is_known or [True] * num_true])[..., None].expand(-1, -1, NUM_STEPS), 10.0,
     )  # fmt: skip
     scorer.watch(lambda index: found)(torch.tensor([0]))
     cells = scorer.cells()
@@ -76,6 +82,9 @@ def test_sets_count_the_missed_and_the_false() -> None:
     assert scores["gospa_m"] == pytest.approx(math.sqrt(9.0 + 150.0))
     assert (scores["num_missed"], scores["num_false"], scores["localisation_error_m"]) == pytest.approx((2.0, 1.0, 3.0))
     assert scores["joint_min_ade_m"] == pytest.approx(3.0)  # of the agents that stand for somebody
+    # the truth of the second agent is silent: it is neither false nor missed
+    unsaid = joint(found, [[0, 0], [500, 0]], [0, 1], is_known=[True, False])
+    assert unsaid["gospa_m"] == pytest.approx(3.0) and unsaid["num_false"] == 0.0
     silent = joint(found, [[0, 0]], [0], is_counted=False)
     assert silent["gospa_m"] == pytest.approx(math.sqrt(50.0)) and silent["num_missed"] == 1.0
 
