@@ -118,19 +118,19 @@ HEAD = """# What do workers, and windows drawn together, bring to a batch?
 
     python benchmarks/batch.py
 
-{num_logs} simulated logs and {num_broken} broken ones among them, all stages; one thread a worker, {cores} logical cores. Speed is a ratio of
-wall times, one run right after the other, after a run of one log that is not counted. All Parquet files of the runs were
-compared byte by byte; every broken log failed with a line of its own, and nothing else did. Settings: `{simulate}`,
-`{settings}`.
+{num_logs} simulated logs and {num_broken} broken ones among them, all stages; one thread a worker, {cores} logical cores.
+Speed is a ratio of wall times, one run right after the other, after a run of one log that is not counted. All Parquet files of
+the runs were compared byte by byte; every broken log failed with a line of its own, and nothing else did. Settings:
+`{simulate}`, `{settings}`.
 
 | workers | finished | failed | speed | same bytes |
 |---|---|---|---|---|
 {batch}
 
 Windows of one log, 30 hypotheses each, drawn by the shipped checkpoint for the prison world, so many together; one thread,
-ratios of processor times. Draws of a window differ by rounding alone where few windows are drawn together, because matrix products
-of other sizes add up in another order. `cadence run` draws up to 32 windows of one log together, and never windows of several
-logs: the gain would end where a log has a few windows of its own, and hypotheses would depend on which logs were given.
+ratios of processor times. Draws of a window differ by rounding alone where few windows are drawn together, because matrix
+products of other sizes add up in another order. `cadence run` draws up to 32 windows of one log together, and never windows of
+several logs: the gain would end where a log has a few windows of its own, and hypotheses would depend on which logs were given.
 
 | windows together | speed | largest difference from all together, m |
 |---|---|---|

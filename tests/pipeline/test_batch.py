@@ -18,6 +18,7 @@ from pipeline.missions import find_missions
 from pipeline.progress import Progress, RelayedProgress
 from pipeline.run import choose_engine, run
 
+pytestmark = pytest.mark.timeout(300)  # on a busy machine the first process takes long to import everything
 QUIET = Progress(quiet=True)
 
 

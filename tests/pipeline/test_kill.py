@@ -14,6 +14,7 @@ from batch_fixture import hidden_in, results_of, start, write_tiny_logs
 
 from pipeline.manifest import hash_file
 
+pytestmark = pytest.mark.timeout(300)  # on a busy machine the first process takes long to import everything
 NUM_KILLS = int(os.environ.get("CADENCE_KILLS", "6"))
 
 
