@@ -38,7 +38,8 @@ def encode_record(record: records.McapRecord) -> bytes:
     """The record with its head, as it stands in a file."""
     builder = RecordBuilder()
     record.write(builder)
-    return builder.end()
+    encoded: bytes = builder.end()  # type: ignore[no-untyped-call]
+    return encoded
 
 
 @dataclass
@@ -101,7 +102,7 @@ class Index:
 
     def ending(self, position: int) -> bytes:
         """Summary, its offsets, footer and magic of a file whose data section ends at `position`."""
-        groups = {**self.groups, Opcode.STATISTICS: encode_record(self.statistics)}
+        groups: dict[int, bytes | bytearray] = {**self.groups, Opcode.STATISTICS: encode_record(self.statistics)}
         if not self.is_searchable:
             groups.pop(Opcode.CHUNK_INDEX, None)
         summary, offsets = bytearray(), bytearray()
