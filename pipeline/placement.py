@@ -135,7 +135,7 @@ def _moved(positions: Positions, target: str, tree: TransformTree, limits: Limit
     return replace(positions, frame_id=frame_id)[is_kept]
 
 
-def _turned(positions: Positions, rows: np.ndarray, rotation: np.ndarray, translation_m: np.ndarray) -> Positions:  # type: ignore[type-arg]
+def _turned(positions: Positions, rows: np.ndarray, rotation: np.ndarray, translation_m: np.ndarray) -> Positions:
     """The positions with those of `rows` (a mask or numbers) turned and moved, and their covariances turned."""
     columns = {
         name: getattr(positions, name).copy() for name in ("first", "second", "z_m", "covariance_m2", "height_covariance_m2")

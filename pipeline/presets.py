@@ -46,7 +46,8 @@ class Preset:
 
 
 def _metric(schema: str, *points: str) -> Preset:
-    return Preset((schema,), *(tuple(f"{point}.{axis}" for point in points) for axis in "xyz"))
+    x, y, z = (tuple(f"{point}.{axis}" for point in points) for axis in "xyz")
+    return Preset((schema,), x, y, z)
 
 
 def _geodetic(schema: str, fix: str = "") -> Preset:

@@ -78,8 +78,9 @@ def batch_summary(outcomes: Sequence["LogOutcome"]) -> str:
     lines = []
     for outcome in outcomes:
         summary = {name: value for stage in outcome.stages for name, value in stage.summary.items()}
-        cells = (str(summary.get(name, "-")) for name in numbers)
-        rows.append((outcome.task.name, outcome.status, *cells, f"{outcome.elapsed_s:.1f} s", outcome.message))
+        windows, agents, detections = (str(summary.get(name, "-")) for name in numbers)
+        elapsed = f"{outcome.elapsed_s:.1f} s"
+        rows.append((outcome.task.name, outcome.status, windows, agents, detections, elapsed, outcome.message))
         for stage in outcome.stages:
             lines += [f"{outcome.task.name}: damaged: {problem}" for problem in stage.summary.get("problems", ())]
             if stage.stage in SHOWN_STAGES and len(outcomes) <= MAX_LOGS_WITH_FILES:

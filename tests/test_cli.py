@@ -14,7 +14,7 @@ from pipeline.manifest import StageResult
 from pipeline.progress import Progress
 
 ROOT = Path(__file__).resolve().parents[1]
-COMMANDS = ("info", "run", "ingest", "extract", "infer", "export", "report", "evaluate", "simulate", "train")
+COMMANDS = ("info", "doctor", "run", "ingest", "extract", "infer", "export", "report", "evaluate", "simulate", "train")
 
 
 def test_help_names_every_command(capsys):

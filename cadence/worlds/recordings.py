@@ -206,14 +206,11 @@ def cut_windows(
     seeds = torch.from_numpy((seed * 1_000_003 + episode) * 10_007 + step)
     time_s = torch.arange(NUM_STEPS, dtype=torch.float64) * recordings.step_s
     later = np.minimum(now[:, None] + np.arange(NUM_STEPS), end[:, None] - 1)
-    past = now[::agents, None] + np.arange(1 - num_tracker_steps, 1)
-    trackers = recordings.tracker_m[np.maximum(past, begin[::agents, None])]
-    trackers[np.less(past, begin[::agents, None])] = np.nan
     context = Context(
         torch.from_numpy(datum),
         torch.from_numpy(step * recordings.step_s),
         torch.from_numpy(by_window(recordings.known_goal_m[track])).double(),
-        torch.from_numpy(trackers),
+        torch.from_numpy(_trackers(recordings, begin[::agents], now[::agents], num_tracker_steps)),
     )
     return ForecastWindows(
         WindowBatch(time_s, detections, seeds, 0),
@@ -222,6 +219,14 @@ def cut_windows(
         torch.from_numpy(np.asarray(episode, dtype=np.int64)),
         torch.from_numpy(np.asarray(step, dtype=np.int64)),
     )
+
+
+def _trackers(recordings: Recordings, begin: Int64s, now: Int64s, num_steps: int) -> NDArray[np.float32]:
+    """The trackers at the steps up to `now` [B, H, M, 2]; NaN before the track's first row, `begin`."""
+    past = now[:, None] + np.arange(1 - num_steps, 1)
+    trackers: NDArray[np.float32] = recordings.tracker_m[np.maximum(past, begin[:, None])]
+    trackers[np.less(past, begin[:, None])] = np.nan
+    return trackers
 
 
 def _detection_rows(

@@ -1,5 +1,6 @@
 """Tasks on this machine: one after the other in this process, or in worker processes that may die without harm to others."""
 
+import functools
 import multiprocessing
 import os
 import signal
@@ -22,7 +23,7 @@ _ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 def run_in_sequence(tasks: Sequence[LogTask], run: RunTask, watch: Watch) -> Generator[LogOutcome, None, None]:
     """Run the tasks one after the other in this process."""
     for task in tasks:
-        yield run(task, RelayedProgress(tell=lambda told, task=task: watch(task, told)))
+        yield run(task, RelayedProgress(tell=functools.partial(watch, task)))
 
 
 def run_in_processes(

@@ -177,7 +177,8 @@ def test_a_stated_position_takes_nothing_of_the_presets_geometry() -> None:
 
 
 def test_paths_may_hold_their_topic_as_in_foxglove() -> None:
-    source = SourceConfig("/det", x='/det.detections[:]{id=="T0"}.bbox.center.position.x', y="p.y", score="/det{ok==true}.score")
+    x = '/det.detections[:]{id=="T0"}.bbox.center.position.x'
+    source = SourceConfig("/det", x=x, y="p.y", score="/det{ok==true}.score")
     paths = resolve_paths(source, "my.Own")
     assert (paths.x, paths.y) == (('.detections[:]{id=="T0"}.bbox.center.position.x',), ("p.y",))
     assert paths.score == ("{ok==true}.score",)

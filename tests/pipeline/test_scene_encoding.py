@@ -94,7 +94,9 @@ def test_time(time_ns):
     assert line.timestamp.ToNanoseconds() == time_ns
 
 
-@pytest.mark.parametrize(("extent_m", "quantum_m"), [(1024.0, 1 / 16), (1000.0, 1 / 16), (700.0, 1 / 32), (8.0, 2**-11), (2.0e6, 128.0)])
+@pytest.mark.parametrize(
+    ("extent_m", "quantum_m"), [(1024.0, 1 / 16), (1000.0, 1 / 16), (700.0, 1 / 32), (8.0, 2**-11), (2.0e6, 128.0)]
+)
 def test_rounding_follows_the_extent(extent_m, quantum_m):
     rounded = round_positions(np.linspace(-extent_m, extent_m, 1001), extent_m)
     assert np.all(rounded / quantum_m == np.round(rounded / quantum_m))
