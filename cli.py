@@ -98,7 +98,7 @@ def info(log: Log, as_json: Json = False) -> None:
 
 @app.command()
 def doctor(logs: Logs, quiet: Quiet = False, as_json: Json = False) -> int:
-    """Say what is wrong with a log, what can be used of it, and what to do.
+    """Say what is wrong with a log, and what to do.
 
     Damage and lost time spans, index and checksums, clocks and gaps, channels that cannot be decoded, what `cadence run`
     would take. Exit code 0: every message can be read; 7: messages are lost, or may be; 3: no message can be read.

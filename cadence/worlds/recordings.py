@@ -203,7 +203,6 @@ def cut_windows(
         (_SIGMA_M**2 * torch.eye(2, dtype=torch.float64)).expand(len(step), agents, rows.shape[1], 2, 2),
         torch.from_numpy(by_window(is_observed)),
     )
-    seeds = torch.from_numpy((seed * 1_000_003 + episode) * 10_007 + step)
     time_s = torch.arange(NUM_STEPS, dtype=torch.float64) * recordings.step_s
     later = np.minimum(now[:, None] + np.arange(NUM_STEPS), end[:, None] - 1)
     context = Context(
@@ -213,7 +212,7 @@ def cut_windows(
         torch.from_numpy(_trackers(recordings, begin[::agents], now[::agents], num_tracker_steps)),
     )
     return ForecastWindows(
-        WindowBatch(time_s, detections, seeds, 0),
+        WindowBatch(time_s, detections, torch.from_numpy((seed * 1_000_003 + episode) * 10_007 + step), 0),
         context,
         torch.from_numpy(by_window(place[later]) - datum[:, None, None]),
         torch.from_numpy(np.asarray(episode, dtype=np.int64)),

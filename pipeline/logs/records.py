@@ -35,8 +35,8 @@ CHUNK_HEAD: Final = struct.Struct("<QQQII")
 """Start time, end time, uncompressed size, CRC and length of the name of the compression."""
 CHUNK_HEAD_BYTES: Final = 64
 """Enough for `CHUNK_HEAD`, the name of the compression and the length of the data."""
-MAX_CHUNK_BYTES: Final = 2**30
-"""Largest chunk that is decompressed; recorders write a few megabytes."""
+MAX_CHUNK_BYTES: Final = 2**28
+"""Largest chunk that is decompressed; recorders write a few megabytes. Reading takes about twice as much memory."""
 MAX_TIME_NS: Final = 2**63 - 1
 """Latest log time that can be used: times are int64 everywhere else (the year 2262)."""
 
