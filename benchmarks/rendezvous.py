@@ -10,6 +10,7 @@ which was trained longer: with known origin, and with detections of unknown orig
 
 import argparse
 import dataclasses
+import hashlib
 import itertools
 import sys
 import time
@@ -29,11 +30,11 @@ from cadence.association.associate import associate
 from cadence.association.types import AssociationConfig
 from cadence.diffusion.scene import SceneModel, SceneSampling
 from cadence.types import Detections, HypothesisSet, WindowBatch
-from cadence.worlds.joint import MEETING_RADIUS_M, JointRecordings, meets
+from cadence.worlds.joint import JointRecordings, meets
 from cadence.worlds.recordings import ForecastWindows, choose_windows, cut_windows
 from cadence.worlds.rendezvous import RendezvousConfig, simulate_rendezvous, simulate_rendezvous_batch
 from cadence.worlds.rendezvous_map import GOALS_M, SITES_M
-from pipeline.checkpoints import find_checkpoint
+from pipeline.checkpoints import checkpoint_hash, find_checkpoint
 from pipeline.manifest import write_atomic
 from pipeline.provenance import versions
 from pipeline.scene import load_scene
@@ -48,12 +49,31 @@ NUM_WAYS = 15
 STEPS = (40, 160)
 """Windows begin so many minutes after their episode: most groups that meet are on their way then, and meet within two hours."""
 KNOWN, KNOWN_ALONE = "known origin, attention", "known origin, no attention (single-target model)"
-SHARED, SHARED_ALONE = "unknown origin, shared embedding, attention", "unknown origin, shared embedding, no attention"
 SHIPPED, TOLD_APART = "shipped: known origin, attention", "shipped: unknown origin, told apart first"
-WITH_NAMES = (KNOWN, KNOWN_ALONE, SHIPPED)
+MEETING_M = 1500.0
+"""Half of the least distance of two sites. Truth meets as often at 300 m; hypotheses may be a kilometre off."""
 _COLOURS = ("#c8553d", "#2a6f97", "#588157")
+_FOLDER = "benchmarks/checkpoints/rendezvous_"
 
-Estimator = Callable[[ForecastWindows], HypothesisSet]
+
+@dataclasses.dataclass(frozen=True)
+class Row:
+    """A row of the tables: its name, the checkpoint, whether it is told whose a detection is, or tells them apart itself."""
+
+    name: str
+    checkpoint: str
+    has_names: bool = True
+    is_told_apart: bool = False
+
+
+ROWS = (
+    Row(KNOWN, f"{_FOLDER}base.safetensors"),
+    Row(KNOWN_ALONE, f"{_FOLDER}alone.safetensors"),
+    Row("unknown origin, shared embedding, attention", f"{_FOLDER}unknown.safetensors", has_names=False),
+    Row("unknown origin, shared embedding, no attention", f"{_FOLDER}unknown_alone.safetensors", has_names=False),
+    Row(SHIPPED, "rendezvous"),
+    Row(TOLD_APART, "rendezvous", has_names=False, is_told_apart=True),
+)
 
 
 def main() -> None:
@@ -64,11 +84,15 @@ def main() -> None:
     windows = held_out(episodes, options.windows, options.seed)
     print(f"{len(windows)} windows of {len(windows.episode.unique())} episodes", file=sys.stderr)
     scores, found = {}, {}
-    for name, estimator in estimators(options.checkpoints, options.known, episodes).items():
+    for row in ROWS:
+        if options.only is not None and row.name not in options.only:
+            continue
         begun = time.perf_counter()
-        found[name] = estimator(windows)
-        scores[name] = Scores.of(name, found[name], windows, options.seed)
-        print(f"{name}: {time.perf_counter() - begun:.0f} s", file=sys.stderr)
+        found[row.name] = drawn(row, windows, episodes, options)
+        scores[row.name] = Scores.of(row, found[row.name], windows)
+        print(f"{row.name}: {time.perf_counter() - begun:.0f} s", file=sys.stderr)
+    if options.only is not None:
+        return
     page = render(scores, windows, options)
     print(page)
     if options.publish is not None:
@@ -83,8 +107,8 @@ def parser() -> argparse.ArgumentParser:
     found.add_argument("--windows", type=int, default=300)
     found.add_argument("--episodes", type=int, default=150)
     found.add_argument("--seed", type=int, default=7, help="of the held-out episodes; training has 2026, validation 1")
-    found.add_argument("--checkpoints", type=Path, default=Path("benchmarks/checkpoints"), help="where the ablations' are")
-    found.add_argument("--known", default="rendezvous", help="checkpoint for known origin, with attention")
+    found.add_argument("--work", type=Path, default=Path("out/benchmarks/rendezvous"), help="hypotheses are kept there")
+    found.add_argument("--only", action="append", metavar="ROW", help="draw only these rows, for a later run; no page")
     found.add_argument("--publish", type=Path, metavar="DOCS", help="write the page and the picture below this folder")
     return found
 
@@ -100,27 +124,26 @@ def held_out(episodes: JointRecordings, num: int, seed: int) -> ForecastWindows:
     return windows[is_useful[chosen.sort().values]]
 
 
-def estimators(folder: Path, known_name: str, episodes: JointRecordings) -> dict[str, Estimator]:
-    """Every row of the table."""
-    sampling = SceneSampling(precision="bfloat16")
-    shipped = load_scene(find_checkpoint(known_name), sampling)
-
-    def ablation(name: str) -> Estimator:
-        return drawn_by(load_scene(folder / f"rendezvous_{name}.safetensors", sampling))
-
-    return {
-        KNOWN: ablation("base"),
-        KNOWN_ALONE: ablation("alone"),
-        SHARED: ablation("unknown"),
-        SHARED_ALONE: ablation("unknown_alone"),
-        SHIPPED: drawn_by(shipped),
-        TOLD_APART: lambda windows: told_apart(shipped, windows, episodes),
-    }
-
-
-def drawn_by(model: SceneModel) -> Estimator:
-    """The model's hypotheses for windows."""
-    return lambda windows: model.placed(windows.context).sample(windows.windows, NUM_HYPOTHESES)
+def drawn(row: Row, windows: ForecastWindows, episodes: JointRecordings, options: argparse.Namespace) -> HypothesisSet:
+    """The row's hypotheses; kept in the work folder, so that a killed run goes on."""
+    weights = find_checkpoint(row.checkpoint)
+    key = [row.name, checkpoint_hash(weights), options.windows, options.episodes, options.seed, versions()["cadence"]]
+    path = options.work / f"{hashlib.sha256(repr(key).encode()).hexdigest()[:16]}.npy"
+    if path.is_file():
+        position = torch.from_numpy(np.load(path)).double()
+        return HypothesisSet(
+            position, torch.full(position.shape[:2], 1.0 / NUM_HYPOTHESES), (("ok",) * position.shape[2],) * len(position)
+        )
+    model = load_scene(weights, SceneSampling(precision="bfloat16"))
+    if row.is_told_apart:
+        found = told_apart(model, windows, episodes)
+    else:
+        found = model.placed(windows.context).sample(windows.windows, NUM_HYPOTHESES)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_suffix(".part.npy")
+    np.save(partial, found.position_m.float().numpy())
+    partial.replace(path)
+    return found
 
 
 def told_apart(model: SceneModel, windows: ForecastWindows, episodes: JointRecordings) -> HypothesisSet:
@@ -235,7 +258,7 @@ class Scores:
     meets: NDArray[np.float64]
 
     @staticmethod
-    def of(name: str, drawn: HypothesisSet, windows: ForecastWindows, seed: int) -> "Scores":
+    def of(row: Row, drawn: HypothesisSet, windows: ForecastWindows) -> "Scores":
         """Where the origin is unknown, the agents of every hypothesis are put in the order that suits the truth best."""
         truth, weight = windows.truth_m.double(), drawn.weight.double()
         position = drawn.position_m.double()
@@ -243,8 +266,8 @@ class Scores:
         joint = metrics.trajectory_energy_score(position, weight, truth, is_known)
         joint_set = torch.stack([set_energy(p, t) for p, t in zip(position, truth, strict=True)])
         absolute = position + windows.context.datum_m[:, None, None, None]
-        share = meets(absolute.numpy(), SITES_M).mean(axis=1)
-        if name not in WITH_NAMES:
+        share = meets(absolute.numpy(), SITES_M, MEETING_M).mean(axis=1)
+        if not row.has_names:
             position = torch.stack([arranged(p, t) for p, t in zip(position, truth, strict=True)])
         at = list(HORIZONS)
         error = metrics.expected_distance(position, weight, truth).mean(dim=1)  # [B, T], mean over agents
@@ -293,13 +316,14 @@ def render(scores: dict[str, Scores], windows: ForecastWindows, options: argpars
         ]
         return "\n".join([head, *rows])
 
-    truth = meets((windows.truth_m + windows.context.datum_m[:, None, None]).numpy(), SITES_M).astype(float)
+    with_names = tuple(row.name for row in ROWS if row.has_names)
+    truth = meets((windows.truth_m + windows.context.datum_m[:, None, None]).numpy(), SITES_M, MEETING_M).astype(float)
     joint = [
         "| | joint energy score, km | without order of agents, km | share of meetings | Brier score |",
         "|---|---|---|---|---|",
     ]
     for name, s in scores.items():
-        labelled = cell(s.joint) if name in WITH_NAMES else "–"
+        labelled = cell(s.joint) if name in with_names else "–"
         brier = (s.meets - truth) ** 2
         joint.append(f"| {name} | {labelled} | {cell(s.joint_set)} | {cell(s.meets, 1)} | {cell(brier, 1, 3)} |")
     joint.append(f"| truth | | | {cell(truth, 1)} | {cell((truth.mean() - truth) ** 2, 1, 3)} (always the mean share) |")
@@ -319,11 +343,11 @@ def render(scores: dict[str, Scores], windows: ForecastWindows, options: argpars
         table("minADE: error at the step of the best joint hypothesis", lambda s: s.least),
         table("Error at the step", lambda s: s.at_step),
         table("Error of the mean at the step", lambda s: s.mean_error),
-        table("Share inside the 90 % region (aim .90)", lambda s: s.is_inside, 1.0, WITH_NAMES),
+        table("Share inside the 90 % region (aim .90)", lambda s: s.is_inside, 1.0, with_names),
         "## Together\n\n" + "\n".join(joint),
         f"Joint energy score, attention over none, known origin: {ratio.value:.3f} [{ratio.low:.3f}, {ratio.high:.3f}]. "
         f"The shipped network, unknown over known origin, without order of agents: {apart.value:.3f} [{apart.low:.3f}, "
-        f"{apart.high:.3f}]. A meeting: all agents within {MEETING_RADIUS_M:.0f} m of one site at one step, by the same rule "
+        f"{apart.high:.3f}]. A meeting: all agents within {MEETING_M:.0f} m of one site at one step, by the same rule "
         "for truth and hypotheses, within the window's two hours.",
         "### Is the share of meetings right where it is stated?\n\n" + reliability(scores[SHIPPED].meets, truth, groups, rng),
         "![Two hypotheses of one window, one with a meeting and one without](../images/rendezvous.png)\n\nTwo joint hypotheses "
@@ -351,7 +375,7 @@ def reliability(
 def draw_two(drawn: HypothesisSet, windows: ForecastWindows) -> plt.Figure:
     """Of windows in which nobody is at a site yet, the one most divided about meeting, and one hypothesis of either kind."""
     absolute = (drawn.position_m.double() + windows.context.datum_m[:, None, None, None]).numpy()
-    has_met = meets(absolute, SITES_M)
+    has_met = meets(absolute, SITES_M, MEETING_M)
     is_near = np.linalg.norm(absolute[:, :, :, 0, None] - SITES_M, axis=-1).min(axis=-1).mean(axis=1) < SOON_M  # [B, A]
     window = int((np.abs(has_met.mean(axis=1) - 0.5) + is_near.any(axis=1)).argmin())
     figure, axes = plt.subplots(1, 2, figsize=(13, 6.5), layout="constrained", sharex=True, sharey=True)
