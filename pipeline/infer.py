@@ -21,7 +21,7 @@ from cadence.diffusion.absolute import AbsoluteSampling
 from cadence.diffusion.feasible import Feasibility, resampled
 from cadence.diffusion.gate import gated
 from cadence.diffusion.general import GeneralModel
-from cadence.diffusion.scene import SceneSampling
+from cadence.diffusion.scene import SceneModel, SceneSampling
 from cadence.errors import ConfigError, DeviceError
 from cadence.network.residual import ResidualNetwork, ResidualNetworkConfig
 from cadence.types import Context, Detections, HypothesisSet, WindowBatch
@@ -47,7 +47,8 @@ _HINDSIGHT_ROWS = 64
 class GuidanceConfig:
     """How constraints act on hypotheses.
 
-    mode           "clean" guides while sampling and repairs at the end; "repair" only repairs; "none" ignores constraints
+    mode           "clean" guides while sampling and repairs at the end; "repair" only repairs; "none" ignores constraints;
+                   of the scene preset only "none" counts (infer.scene says how it guides), and the paper preset has infer.paper
     margin_m       distance to keep from obstacles
     max_speed_mps  a speed that the target cannot exceed; None = no limit
     """
@@ -189,7 +190,7 @@ def _plan(config: InferConfig, detections: pa.Table, obstacles: Obstacles, weigh
     """The draws by the preset of the checkpoint, which decides the grid as well."""
     preset = None if weights is None else read_info(weights).preset
     if weights is not None and preset == "scene":
-        scene = load_scene(weights, config.scene)
+        scene = _limited(load_scene(weights, config.scene), config.guidance)
         seen = _Seen.of(config, detections, scene_grid(scene.config, config.grid.stride_steps))
         limits = Obstacles.none() if config.guidance.mode == "none" else obstacles
         draws = _placed_draws(scene, seen, lambda windows: scene_context(windows, start_ns), config.num_hypotheses, limits)
@@ -206,6 +207,19 @@ def _plan(config: InferConfig, detections: pa.Table, obstacles: Obstacles, weigh
     else:
         draws = draw_tracks(seen.ways, lambda windows: draw_hypotheses(model, windows, config, obstacles))
     return _Plan(seen, draws, _model_summary(model) | _association_summary(seen))
+
+
+def _limited(scene: SceneModel, guidance: GuidanceConfig) -> SceneModel:
+    """The scene model with the margin and the speed limit of all presets, where they are stricter than its own."""
+    margin_m = max(scene.sampling.margin_m, guidance.margin_m)
+    longest_m = scene.config.max_step_m
+    if guidance.max_speed_mps is not None:
+        longest_m = min(longest_m, guidance.max_speed_mps * scene.config.step_s)
+    return dataclasses.replace(
+        scene,
+        sampling=dataclasses.replace(scene.sampling, margin_m=margin_m),
+        config=dataclasses.replace(scene.config, max_step_m=longest_m),
+    )
 
 
 def _placed_draws(

@@ -16,7 +16,7 @@ from cadence.network.scene import SceneNetworkConfig
 from cadence.training.loop import OptimiserConfig
 from cadence.worlds.recordings import Recordings, cut_windows
 from pipeline.checkpoints import read_info
-from pipeline.infer import InferConfig, infer
+from pipeline.infer import GuidanceConfig, InferConfig, infer
 from pipeline.progress import Progress
 from pipeline.recordings import RecordingsConfig, save_recordings
 from pipeline.scene import load_scene
@@ -114,6 +114,28 @@ def test_infer_takes_a_scene_checkpoint(sources, tmp_path, mission_directory):
     other = dataclasses.replace(settings, scene=SceneSampling(sampler="few"))
     with pytest.raises(ConfigError, match="not tuned"):
         infer(mission_directory, other, QUIET)
+
+
+def test_the_limits_of_all_presets_hold_for_a_scene_checkpoint(sources, tmp_path, mission_directory):
+    weights = train(tmp_path / "scene", config(sources), QUIET).outputs[0]
+    rock = {"kind": "circle", "x_m": 1500.0, "y_m": 250.0, "radius_m": 300.0}
+    (mission_directory / "obstacles.json").write_text(json.dumps({"version": 1, "obstacles": [rock]}))
+
+    def least_distance_and_longest_step(**guidance):
+        settings = InferConfig(num_hypotheses=20, checkpoint=str(weights), guidance=GuidanceConfig(**guidance))
+        infer(mission_directory, settings, QUIET)
+        table, _ = read_table(mission_directory / "hypotheses.parquet", "hypotheses")
+        place = np.array(table["position_m"].to_pylist()) + np.array([table["datum_x_m"], table["datum_y_m"]]).T[:, None]
+        # a target may have been seen inside the margin: states from which it had time to leave are asked
+        far = np.linalg.norm(place[:, 60:] - [rock["x_m"], rock["y_m"]], axis=-1).min() - rock["radius_m"]
+        return far, np.linalg.norm(np.diff(place, axis=1), axis=-1).max()
+
+    near, _ = least_distance_and_longest_step()
+    far, _ = least_distance_and_longest_step(margin_m=100.0)
+    _, fast = least_distance_and_longest_step(mode="none")  # without obstacles: a way around one is longer
+    _, slow = least_distance_and_longest_step(mode="none", max_speed_mps=0.5)
+    assert -1.0 < near < 99.0 <= far
+    assert slow < 30.5 < fast
 
 
 @pytest.fixture
