@@ -57,6 +57,24 @@ def _heights(xx: float, xy: float, yy: float, stated: list[float]) -> tuple[floa
     return (xz, yz, zz) if determinant > 0 else (0.0, 0.0, zz)
 
 
+def stated_covariances(matrices: Float64s) -> tuple[Float64s, npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
+    """`stated_covariance` of N matrices [N, 4, 6, 9 or 36] at once: covariances [N, 6], which are stated, which are none.
+
+    Covariances that are not stated mean nothing.
+    """
+    places = _PLACES[matrices.shape[1]]
+    with np.errstate(all="ignore"):
+        xx, xy, yy, *rest = (matrices[:, place] for place in places)
+        is_unknown = ((xx == 0) & (yy == 0)) | (xx < 0) | (yy < 0)
+        is_definite = np.isfinite(xx) & np.isfinite(xy) & np.isfinite(yy) & (xx * yy > xy * xy)
+        xz, yz, zz = rest or [np.zeros_like(xx)] * 3
+        has_height = np.isfinite(xz) & np.isfinite(yz) & np.isfinite(zz) & (zz > 0)
+        determinant = xx * (yy * zz - yz * yz) - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz)
+        is_full = has_height & (determinant > 0)
+        heights = (np.where(is_full, xz, 0.0), np.where(is_full, yz, 0.0), np.where(has_height, zz, (xx + yy) / 2))
+    return np.column_stack([xx, xy, yy, *heights]), ~is_unknown & is_definite, ~is_unknown & ~is_definite
+
+
 def rotated(covariance_m2: Float64s, rotation: Float64s) -> Float64s:
     """R C R' [N, 6] of covariances [N, 6] in a frame that is turned by R [N, 3, 3]."""
     full = covariance_m2[:, [0, 1, 3, 1, 2, 4, 3, 4, 5]].reshape(-1, 3, 3)

@@ -21,7 +21,8 @@ from pipeline.logs.reader import MissionLog
 from pipeline.manifest import StageResult, run_stage
 from pipeline.obstacles import OBSTACLES_NAME, ObstacleSources, collect_obstacles, write_obstacles
 from pipeline.placement import Placing, bring_together, in_enu, mission_frame, place
-from pipeline.positions import ChannelReader, Positions, Rows, read_positions
+from pipeline.position_reading import read_positions
+from pipeline.positions import ChannelReader, Positions, Rows
 from pipeline.progress import Progress
 from pipeline.selection import ROLES, select_readers, selected_channels
 from pipeline.sources import SourceConfig

@@ -1,6 +1,6 @@
-"""Decoded messages → columns of positions: which source reads which channel, and what each of its messages says.
+"""Messages → columns of positions: which source reads which channel, and what each of its messages says.
 
-One pass over the log serves all roles. What cannot be used is counted, never passed on in silence.
+What cannot be used is counted, never passed on in silence.
 """
 
 import math
@@ -8,17 +8,19 @@ from array import array
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
+from functools import partial
 from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
 
 from cadence.errors import ConfigError
-from pipeline.covariances import NONE_COVARIANCE, Covariance, isotropic, stated_covariance
-from pipeline.logs.decode import Decoder, UndecodableChannel, UndecodableMessage, decoder_for
-from pipeline.logs.reader import Channel, MissionLog, RawMessage
+from pipeline.covariances import NONE_COVARIANCE, Covariance, isotropic, stated_covariance, stated_covariances
+from pipeline.field_columns import FieldColumns, mapped
+from pipeline.logs.channels import Batch
+from pipeline.logs.decode import UndecodableChannel
+from pipeline.logs.reader import Channel, RawMessage
 from pipeline.message_path import MissingFieldError, Place, at_place, parse_path
-from pipeline.progress import Progress
 from pipeline.sources import LOG_TIME, PATH_KEYS, PUBLISH_TIME, SourceConfig, resolve_paths
 from pipeline.stamps import stamp_ns
 
@@ -192,6 +194,43 @@ class ChannelReader:
             self.rows.sensors.append(self._identity("sensor", values["sensor"], place))
             self.rows.frame_ids.append(values["frame_id"] or "")
 
+    def field_columns(self) -> FieldColumns:
+        """What reads the source's fields of many messages at once; `UndecodableChannel` where that cannot be done."""
+        if self.alternatives != "first":
+            raise UndecodableChannel(f"{self.channel.topic}: holds several positions a message")
+        readers = dict(zip(_COLUMNS, self.positions[0], strict=True)) | self.fields
+        columns = FieldColumns(self.channel, {name: reader.paths for name, reader in readers.items()})
+        if not {"first", "second"} | {name for name, reader in readers.items() if reader.is_needed} <= columns.names:
+            raise UndecodableChannel(f"{self.channel.topic}: lacks a field")
+        return columns
+
+    def read_columns(self, columns: Mapping[str, npt.NDArray[Any]], batch: Batch) -> None:
+        """Append what `field_columns` read of a batch: rows and counts are those of `read`, one message after the other."""
+        self.counts["messages"] += len(batch)
+        for name, reader in zip((*_COLUMNS, *self.fields), (*self.positions[0], *self.fields.values()), strict=True):
+            reader.is_found = reader.is_found or name in columns
+        has_fix = np.ones(len(batch), np.bool_)
+        if "status" in columns:
+            has_fix &= ~(columns["status"] < 0)
+        if "flags" in columns:
+            has_fix &= columns["flags"] % 2 != 0
+        num_rows = int(has_fix.sum())
+        self.counts["no_fix"] += len(batch) - num_rows
+        columns = {name: column[has_fix] for name, column in columns.items()}
+        log_time_ns, sequence = batch.log_time_ns[has_fix], batch.sequence[has_fix]
+        time_ns = batch.publish_time_ns[has_fix].astype(np.int64) if self.source.time == PUBLISH_TIME else log_time_ns
+        if "time" in columns:
+            time_ns = np.where(columns["time"] == 0, time_ns, columns["time"])
+        absent = np.full(num_rows, math.nan)
+        numbers = [columns.get(name, absent) for name in (*_COLUMNS, "score")]
+        self.rows.integers.frombytes(np.column_stack([time_ns, log_time_ns, sequence]).astype(np.int64).tobytes())
+        self.rows.floats.frombytes(np.column_stack([*numbers, self._covariances(columns, num_rows)]).tobytes())
+        for kind, names in (("agent", self.rows.agents), ("sensor", self.rows.sensors)):
+            stated = columns[kind].tolist() if kind in columns else [None] * num_rows
+            names += mapped(stated, partial(self._identity, kind, place=()))
+        frames = columns["frame_id"].tolist() if "frame_id" in columns else [""] * num_rows
+        self.rows.frame_ids += mapped(frames, lambda name: _frame_name(name) or "")
+
     def check(self) -> None:
         """`ConfigError` where something that the user stated was in no message."""
         alternatives = [(reader,) for reader in self.fields.values()] + list(zip(*self.positions, strict=True))
@@ -238,6 +277,15 @@ class ChannelReader:
             self.counts["bad_covariance"] += 1
             return self.unknown
 
+    def _covariances(self, columns: Mapping[str, npt.NDArray[Any]], num_rows: int) -> Float64s:
+        """`_covariance` [N, 6] of many messages at once."""
+        if "covariance" not in columns:
+            return np.tile(np.array(self.unknown), (num_rows, 1))
+        covariances, is_stated, is_bad = stated_covariances(columns["covariance"])
+        says_something = columns["covariance_type"] != 0 if "covariance_type" in columns else np.ones(num_rows, np.bool_)
+        self.counts["bad_covariance"] += int((is_bad & says_something).sum())
+        return np.where((is_stated & says_something)[:, None], covariances, np.array(self.unknown))
+
     def _identity(self, kind: str, value: Any, place: Place) -> str | None:
         """Constant, from a field, or None; truth and poses need a name, so theirs is at last the topic's (and the place)."""
         constant = self.names[kind]
@@ -252,57 +300,11 @@ def _frame_name(value: Any) -> str | None:
     return value.lstrip("/") or None if isinstance(value, str) else None  # ROS 1 wrote /map
 
 
+_COLUMNS = ("first", "second", "z")
 _METRIC = ("x", "y", "z")
 _GEODETIC = ("latitude", "longitude", "altitude")
 _OTHERS = ("covariance", "covariance_type", "status", "flags", "time", "frame_id", "agent", "sensor", "score")
 _CONVERSIONS: Mapping[str, Callable[[Any], Any]] = {"time": stamp_ns, "frame_id": _frame_name}
-
-
-def read_positions(
-    log: MissionLog,
-    readers: Sequence[ChannelReader],
-    progress: Progress,
-    start_ns: int | None = None,
-    end_ns: int | None = None,
-) -> Counter[str]:
-    """Feed the messages of the readers' channels with start_ns <= log time < end_ns to them; counts of what was not used."""
-    counts: Counter[str] = Counter()
-    by_channel: dict[int, list[ChannelReader]] = {}
-    for reader in readers:
-        by_channel.setdefault(reader.channel.id, []).append(reader)
-    decoders: dict[int, Decoder] = {}
-    for number, served in list(by_channel.items()):
-        try:
-            decoders[number] = decoder_for(served[0].channel)
-        except UndecodableChannel as error:
-            counts["undecodable"] += served[0].channel.message_count or 0
-            progress.note(f"extract: {error}")
-            del by_channel[number]
-    topics = {reader.channel.topic for reader in readers}
-    num_read = 0
-
-    def advance(num_bytes: int) -> None:
-        bar.update(num_bytes)
-
-    with progress.bar(log.size_bytes, "extract", unit="B", scale=True) as bar:
-        for raw in log.messages(topics, advance, start_ns, end_ns):
-            served = by_channel.get(raw.channel.id, [])
-            if not served:
-                continue
-            num_read += 1
-            try:
-                message = decoders[raw.channel.id](raw.data)
-            except UndecodableMessage:
-                counts["undecodable"] += 1
-                continue
-            for reader in served:
-                reader.read(message, raw)
-    if start_ns is not None or end_ns is not None:
-        counts["outside_time_cut"] = sum(served[0].channel.message_count or 0 for served in by_channel.values()) - num_read
-    for reader in readers:
-        reader.check()
-        counts.update(reader.counts)
-    return counts
 
 
 def _number(value: Any) -> float:

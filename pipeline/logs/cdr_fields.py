@@ -18,6 +18,7 @@ from pipeline.logs.decode import UndecodableChannel, cdr_types
 
 _LITTLE_ENDIAN: Final = (0, 1)
 _HEAD_BYTES: Final = 4
+_ALIGNMENT: Final = 4
 _DTYPES: Final = {
     "bool": "u1", "byte": "u1", "char": "u1", "octet": "u1", "int8": "i1", "uint8": "u1", "int16": "<i2", "uint16": "<u2",
     "int32": "<i4", "uint32": "<u4", "int64": "<i8", "uint64": "<u8", "float32": "<f4", "float64": "<f8",
@@ -40,19 +41,22 @@ class _Member:
 class CdrFields:
     """Reads the fields at dotted `paths` from batches of `channel`: numbers, arrays of numbers of fixed length, strings.
 
+    With `is_whole` messages are walked to their ends, so that only those are read which `decode` accepts as a whole.
     Raises `UndecodableChannel` where that cannot be done without decoding whole messages.
     """
 
-    def __init__(self, channel: Channel, paths: Sequence[str]) -> None:
+    def __init__(self, channel: Channel, paths: Sequence[str], is_whole: bool = False) -> None:
         if channel.message_encoding != "cdr":
             raise UndecodableChannel(f"{channel.topic}: is not CDR but {channel.message_encoding!r}")
         self.paths = tuple(paths)
-        self.members = _way(channel, set(paths))
+        self.is_whole = is_whole
+        self.members = _way(channel, set(paths), is_whole)
 
     def columns(self, batch: Batch) -> tuple[npt.NDArray[np.bool_], dict[str, Column]]:
         """Which of the N messages could be read, and the columns [N] or [N, count] by path (strings as objects).
 
-        Messages that are too short, or in another byte order, are not read; their cells mean nothing.
+        Messages that are too short, in another byte order, or with strings that are none on the way are not read; their
+        cells mean nothing.
         """
         walker = _Walker(batch)
         columns = {}
@@ -61,6 +65,8 @@ class CdrFields:
                 columns[member.path] = walker.take(member)
             else:
                 walker.skip(member)
+        if self.is_whole:
+            walker.finish()
         return walker.is_sound, columns
 
 
@@ -78,10 +84,7 @@ class _Walker:
     def take(self, member: _Member) -> Column:
         """The member's column; stands behind it afterwards."""
         if not member.dtype:
-            begin, length = self._string()
-            spans = zip(begin.tolist(), (begin + np.maximum(length - 1, 0)).tolist(), self.is_sound.tolist(), strict=True)
-            texts = [self.data[start:end].decode(errors="replace") if sound else "" for start, end, sound in spans]
-            return np.array(texts, dtype=object)
+            return self._texts()
         dtype = np.dtype(member.dtype)
         begin = self._advance(dtype.itemsize, dtype.itemsize * (member.count or 0))
         values = self._gather(f"V{dtype.itemsize * (member.count or 0)}", begin).view(dtype)
@@ -90,7 +93,7 @@ class _Walker:
     def skip(self, member: _Member) -> None:
         """Stand behind the member."""
         if not member.dtype:
-            self._string()
+            self._texts()
             return
         size = np.dtype(member.dtype).itemsize
         if member.count is not None:
@@ -100,11 +103,19 @@ class _Walker:
         begin = np.where(length > 0, self._aligned(size), self.place)  # an empty list has no padding
         self._move(begin, begin + length * size)
 
-    def _string(self) -> tuple[Places, Places]:
+    def finish(self) -> None:
+        """Behind the last member there may be padding, but no more."""
+        self.is_sound = self.is_sound & (self.end - self.place < _ALIGNMENT)
+
+    def _texts(self) -> Column:
         length = self._length()
-        begin = self.place
-        self._move(begin, begin + length)
-        return begin, np.where(self.is_sound, length, 0)
+        begin = self._move(self.place, self.place + length)
+        spans = zip(begin.tolist(), np.where(self.is_sound, begin + length, 0).tolist(), strict=True)
+        pieces = [self.data[start:end] for start, end in spans]
+        texts = {piece: _text(piece) for piece in set(pieces)}  # most of them are alike
+        values = np.array([texts[piece] for piece in pieces], dtype=object)
+        self.is_sound = self.is_sound & (values != None)  # noqa: E711 - by element
+        return values
 
     def _length(self) -> Places:
         begin = self._advance(4, 4)
@@ -133,16 +144,25 @@ class _Walker:
         return view[np.where(self.is_sound, begin, 0)]
 
 
-def _way(channel: Channel, wanted: set[str]) -> tuple[_Member, ...]:
-    """The members from the beginning of a message to the last that is wanted."""
+def _text(piece: bytes) -> str | None:
+    """A string with its zero at the end; None where it is none."""
+    try:
+        return piece[:-1].decode() if piece[-1:] == b"\0" else None
+    except UnicodeDecodeError:
+        return None
+
+
+def _way(channel: Channel, wanted: set[str], is_whole: bool) -> tuple[_Member, ...]:
+    """The members from the beginning of a message to the last that is wanted, or to its end."""
     store, name = cdr_types(channel)
     way: list[_Member] = []
     missing = set(wanted)
     for member in _members(store, name, "", 0):
-        if not missing:
+        if not missing and not is_whole:
             break
         if member is None:
-            raise UndecodableChannel(f"{channel.topic}: {sorted(missing)[0]} lies behind a list of structures")
+            what = sorted(missing)[0] if missing else "the end"
+            raise UndecodableChannel(f"{channel.topic}: {what} lies behind a list of structures")
         if member.path in missing and member.count is None:
             raise UndecodableChannel(f"{channel.topic}: {member.path} is a list of varying length")
         missing.discard(member.path)

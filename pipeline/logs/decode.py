@@ -4,6 +4,7 @@ Decoded messages are plain trees: dataclasses (CDR, ROS 1), protobuf messages or
 arrays for repeated fields. `field` reads both kinds.
 """
 
+import functools
 import itertools
 import json
 import re
@@ -30,6 +31,7 @@ _COMMENT_OR_TEXT: Final = re.compile(rf"{_TEXT}|/\*.*?\*/|//[^\n]*", re.DOTALL)
 _ANNOTATION: Final = re.compile(rf'@\w+\s*\((?:[^()"]|{_TEXT})*\)')
 _PLAIN_CDR: Final = (b"\x00\x00", b"\x00\x01")
 _MAX_REASON = 160
+_MAX_STORES: Final = 64
 _STAMPS: Final = {
     "builtin_interfaces/msg/Time": "int32 sec\nuint32 nanosec\n",
     "builtin_interfaces/msg/Duration": "int32 sec\nuint32 nanosec\n",
@@ -143,24 +145,26 @@ def cdr_types(channel: Channel) -> tuple[Typestore, str]:
     Raises `UndecodableChannel` where the schema cannot be read.
     """
     with _named(channel, UndecodableChannel, "cannot be decoded"):
-        return _cdr_types(channel)
+        return _cdr_types(channel.schema_name, channel.schema_encoding, channel.schema_data)
 
 
 def _rosbags_cdr_decoder(channel: Channel) -> Decoder:
-    store, name = _cdr_types(channel)
+    store, name = _cdr_types(channel.schema_name, channel.schema_encoding, channel.schema_data)
     return lambda data: store.deserialize_cdr(data, name)
 
 
-def _cdr_types(channel: Channel) -> tuple[Typestore, str]:
-    text = channel.schema_data.decode("utf-8")
-    if channel.schema_encoding == "ros2idl":
+@functools.lru_cache(maxsize=_MAX_STORES)
+def _cdr_types(schema_name: str, schema_encoding: str, schema_data: bytes) -> tuple[Typestore, str]:
+    """A schema takes longer to read than a thousand messages, and is asked for more than once."""
+    text = schema_data.decode("utf-8")
+    if schema_encoding == "ros2idl":
         types = get_types_from_idl(_plain_idl(text))
-    elif channel.schema_encoding == "ros2msg":
-        types = get_types_from_msg(text, channel.schema_name)
+    elif schema_encoding == "ros2msg":
+        types = get_types_from_msg(text, schema_name)
     else:
-        raise ValueError(f"schema encoding {channel.schema_encoding!r} is not known for CDR")
+        raise ValueError(f"schema encoding {schema_encoding!r} is not known for CDR")
     store = _store(types, Stores.EMPTY)
-    return store, _type_name(store, channel.schema_name)
+    return store, _type_name(store, schema_name)
 
 
 def _ros1_decoder(channel: Channel) -> Decoder:

@@ -21,7 +21,8 @@ from rosbags.typesys import Stores
 from small_logs import START_NS, Row, write_log
 
 from pipeline.logs.reader import open_log
-from pipeline.positions import ChannelReader, Positions, read_positions
+from pipeline.position_reading import read_positions
+from pipeline.positions import ChannelReader, Positions
 from pipeline.presets import PRESETS, normalise_schema, preset_for
 from pipeline.progress import Progress
 from pipeline.sources import SourceConfig
