@@ -117,6 +117,10 @@ def ours(path: Path) -> dict[str, tuple[str, Callable[[], int]]]:
     from pipeline.logs.cdr_fields import CdrFields
     from pipeline.logs.decode import decoder_for
     from pipeline.logs.reader import MissionLog, open_log, reopen
+    from pipeline.position_reading import read_positions
+    from pipeline.positions import ChannelReader
+    from pipeline.progress import Progress
+    from pipeline.sources import SourceConfig
 
     checked = open_log(path)
     channel = next(channel for channel in checked.channels if channel.topic == TOPIC)
@@ -132,6 +136,11 @@ def ours(path: Path) -> dict[str, tuple[str, Callable[[], int]]]:
         reader = CdrFields(channel, FIELDS)
         return sum(int(reader.columns(batch)[0].sum()) for batch in known().batches([TOPIC]))
 
+    def extracted() -> int:
+        reader = ChannelReader(channel, SourceConfig(TOPIC), "detections", True, {})
+        read_positions(known(), [reader], Progress(quiet=True))
+        return len(reader.finish())
+
     return {
         "all messages": ("all", lambda: sum(1 for _ in known().messages())),
         "all messages, in columns": ("all", lambda: sum(map(len, known().batches()))),
@@ -140,6 +149,7 @@ def ours(path: Path) -> dict[str, tuple[str, Callable[[], int]]]:
         "one topic, in columns": ("topic", lambda: sum(map(len, known().batches([TOPIC])))),
         "one topic, every message decoded": ("decoded", decode),
         "one topic, decoded to columns: stamp, frame, position, covariance": ("decoded", fields),
+        "one topic, as extract reads it: rows of positions": ("decoded", extracted),
     }
 
 
