@@ -31,7 +31,7 @@ demo: $(STAMP)  ## Simulate a mission, run the whole pipeline on it, say where t
 	@echo "  in Foxglove $$(ls $(DEMO)/logs/*.mcap) together with $$(ls $(DEMO)/results/*/*.cadence.mcap)"
 	@echo "  layout      $$(ls $(DEMO)/results/*/*.layout.json | head -1)    (Foxglove: Layouts, Import from file)"
 	@echo "Next:"
-	@echo "  $(BIN)/cadence evaluate $(DEMO)/results/*"
+	@echo "  $(BIN)/cadence evaluate $(DEMO)/results"
 	@echo "  $(BIN)/cadence info YOUR_LOG.mcap"
 	@echo "  $(BIN)/cadence run YOUR_LOG.mcap --out out/mine"
 

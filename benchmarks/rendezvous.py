@@ -42,6 +42,7 @@ from pipeline.scene import load_scene
 HORIZONS = (0, 29, 59, 89, 119)
 LABELS = ("0", "30", "60", "90", "120")
 NUM_HYPOTHESES = 30
+APART_M = 4500.0
 SOON_M = 3000.0
 """Agents nearer to a site than this are not shown in the picture: that they meet is no question any more."""
 NUM_WAYS = 15
@@ -373,14 +374,19 @@ def reliability(
 
 
 def draw_two(drawn: HypothesisSet, windows: ForecastWindows) -> plt.Figure:
-    """Of windows in which nobody is at a site yet, the one most divided about meeting, and one hypothesis of either kind."""
+    """Of windows in which nobody is at a site yet, the one most divided about meeting, and one hypothesis of either kind.
+
+    One that goes straight on is one whose agents never come near one site together.
+    """
     absolute = (drawn.position_m.double() + windows.context.datum_m[:, None, None, None]).numpy()
     has_met = meets(absolute, SITES_M, MEETING_M)
     is_near = np.linalg.norm(absolute[:, :, :, 0, None] - SITES_M, axis=-1).min(axis=-1).mean(axis=1) < SOON_M  # [B, A]
-    window = int((np.abs(has_met.mean(axis=1) - 0.5) + is_near.any(axis=1)).argmin())
+    is_apart = ~meets(absolute, SITES_M, APART_M)
+    window = int((np.minimum(has_met.mean(axis=1), is_apart.mean(axis=1)) - is_near.any(axis=1)).argmax())
     figure, axes = plt.subplots(1, 2, figsize=(13, 6.5), layout="constrained", sharex=True, sharey=True)
     for axis, kind, title in zip(axes, (True, False), ("one that meets", "one that goes straight on"), strict=True):
-        chosen = int(np.flatnonzero(has_met[window] == kind)[0])
+        of_kind = (has_met if kind else is_apart)[window]
+        chosen = int(np.flatnonzero(of_kind)[0])
         _draw_place(axis)
         for agent, colour in enumerate(_COLOURS):
             for other in absolute[window, :, agent]:
@@ -389,8 +395,7 @@ def draw_two(drawn: HypothesisSet, windows: ForecastWindows) -> plt.Figure:
             d = windows.windows.detections
             seen = d.position_m[window, agent][d.is_observed[window, agent]] + windows.context.datum_m[window]
             axis.plot(*seen.numpy().T / 1e3, "o", color=colour, markersize=4, markeredgecolor="white", markeredgewidth=0.5)
-        share = has_met[window].mean()
-        axis.set_title(f"{title} ({share if kind else 1 - share:.0%} of the hypotheses)")
+        axis.set_title(f"{title} ({of_kind.mean():.0%} of the hypotheses)")
     return figure
 
 

@@ -77,7 +77,9 @@ def batch_summary(outcomes: Sequence["LogOutcome"]) -> str:
     rows = [("log", "status", "windows", "agents", "detections", "time", "")]
     lines = []
     for outcome in outcomes:
-        summary = {name: value for stage in outcome.stages for name, value in stage.summary.items()}
+        # what infer says of agents and windows goes before what other stages count under the same name
+        stages = sorted(outcome.stages, key=lambda stage: stage.stage == "infer")
+        summary = {name: value for stage in stages for name, value in stage.summary.items()}
         windows, agents, detections = (str(summary.get(name, "-")) for name in numbers)
         elapsed = f"{outcome.elapsed_s:.1f} s"
         rows.append((outcome.task.name, outcome.status, windows, agents, detections, elapsed, outcome.message))
