@@ -131,10 +131,7 @@ def drawn(row: Row, windows: ForecastWindows, episodes: JointRecordings, options
     key = [row.name, checkpoint_hash(weights), options.windows, options.episodes, options.seed, versions()["cadence"]]
     path = options.work / f"{hashlib.sha256(repr(key).encode()).hexdigest()[:16]}.npy"
     if path.is_file():
-        position = torch.from_numpy(np.load(path)).double()
-        return HypothesisSet(
-            position, torch.full(position.shape[:2], 1.0 / NUM_HYPOTHESES), (("ok",) * position.shape[2],) * len(position)
-        )
+        return equally_likely(torch.from_numpy(np.load(path)).double())
     model = load_scene(weights, SceneSampling(precision="bfloat16"))
     if row.is_told_apart:
         found = told_apart(model, windows, episodes)
@@ -145,6 +142,12 @@ def drawn(row: Row, windows: ForecastWindows, episodes: JointRecordings, options
     np.save(partial, found.position_m.float().numpy())
     partial.replace(path)
     return found
+
+
+def equally_likely(position: Tensor) -> HypothesisSet:
+    """Hypotheses [B, K, A, T, 2] of one weight, all agents there."""
+    weight = torch.full(position.shape[:2], 1.0 / position.shape[1])
+    return HypothesisSet(position, weight, (("ok",) * position.shape[2],) * len(position))
 
 
 def told_apart(model: SceneModel, windows: ForecastWindows, episodes: JointRecordings) -> HypothesisSet:
@@ -165,10 +168,7 @@ def told_apart(model: SceneModel, windows: ForecastWindows, episodes: JointRecor
         parts.append(drawn.reshape(len(chunk), NUM_HYPOTHESES, *drawn.shape[2:]))
     position = torch.cat(parts)
     last = torch.stack([_latest(windows.windows.detections[slice(b, b + 1)]) for b in range(len(windows))])
-    position = torch.where(position.isnan(), last[:, None, None, None], position)
-    return HypothesisSet(
-        position, torch.full(position.shape[:2], 1.0 / NUM_HYPOTHESES), (("ok",) * position.shape[2],) * len(position)
-    )
+    return equally_likely(torch.where(position.isnan(), last[:, None, None, None], position))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

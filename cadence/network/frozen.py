@@ -68,12 +68,12 @@ class FrozenUNet:
         for blocks, narrow in zip(unet.down, unet.narrow, strict=True):
             for block in blocks:  # type: ignore[attr-defined]
                 hidden = self._block(block, hidden, next(film))
-            hidden = self._seen(hidden, len(skips) - 1, team)
+            hidden = self._seen(hidden, len(skips), team)
             skips.append(hidden)
             hidden = self._convolved(narrow, hidden)
         for block in unet.middle:
             hidden = self._block(block, hidden, next(film))  # type: ignore[arg-type]
-        hidden = self._seen(hidden, len(skips) - 1, team)
+        hidden = self._seen(hidden, len(skips), team)
         skips.pop()
         for widen, blocks in zip(unet.widen, unet.up, strict=True):
             hidden = torch.cat([self._convolved(widen, hidden), skips.pop()], dim=1)
@@ -101,11 +101,11 @@ class FrozenUNet:
         hidden = by_window.reshape(rows, 1, steps, channels).permute(0, 3, 1, 2)
         return self._convolved(block.second, functional.silu(hidden, inplace=True)).add_(skip)
 
-    def _seen(self, hidden: Tensor, place: int, team: Team | None) -> Tensor:
+    def _seen(self, hidden: Tensor, level: int, team: Team | None) -> Tensor:
         """Attention between agents, in float32, of pictures [N, C, 1, T]."""
-        if team is None or not self.unet.across:
+        if team is None or not self.unet.has_attention(level):
             return hidden
-        seen = self.unet.seen(hidden[:, :, 0].float(), place, team)[:, :, None].to(self.dtype)
+        seen = self.unet.seen(hidden[:, :, 0].float(), level, team)[:, :, None].to(self.dtype)
         return seen.contiguous(memory_format=torch.channels_last)
 
     def _convolved(self, module: nn.Module, picture: Tensor) -> Tensor:

@@ -99,12 +99,12 @@ class UNet(nn.Module):
         for blocks, narrow in zip(self.down, self.narrow, strict=True):
             for block in blocks:  # type: ignore[attr-defined]
                 hidden = block(hidden, condition)
-            hidden = self.seen(hidden, len(skips) - 1, team)
+            hidden = self.seen(hidden, len(skips), team)
             skips.append(hidden)
             hidden = narrow(hidden)
         for block in self.middle:
             hidden = block(hidden, condition)
-        hidden = self.seen(hidden, len(skips) - 1, team)
+        hidden = self.seen(hidden, len(skips), team)
         skips.pop()
         for widen, blocks in zip(self.widen, self.up, strict=True):
             hidden = torch.cat([widen(hidden), skips.pop()], dim=1)
@@ -114,12 +114,16 @@ class UNet(nn.Module):
         result: Tensor = self.head(torch.cat([hidden, trajectory], dim=1))
         return result
 
-    def seen(self, hidden: Tensor, place: int, team: Team | None) -> Tensor:
-        """States [N, C, T] after the attention at `place`, where there is one there and a team."""
-        if team is None or not 0 <= place < len(self.across):
+    def seen(self, hidden: Tensor, level: int, team: Team | None) -> Tensor:
+        """States [N, C, T] after the attention that follows `level`; unchanged where there is none, or no team."""
+        if team is None or not self.has_attention(level):
             return hidden
-        result: Tensor = self.across[place](hidden, team)
+        result: Tensor = self.across[level - 1](hidden, team)
         return result
+
+    def has_attention(self, level: int) -> bool:
+        """Whether agents see each other after the blocks of `level`; the middle counts as one level more than there are."""
+        return 1 <= level <= len(self.across)
 
 
 class _Block(nn.Module):

@@ -7,8 +7,9 @@ import pytest
 import torch
 
 from cadence.diffusion.scene import SceneModel, SceneSampling
-from cadence.diffusion.scene_frame import SceneConfig
+from cadence.diffusion.scene_frame import SceneConfig, scene_inputs
 from cadence.diffusion.scene_team import agent_rows, shared_detections
+from cadence.network.frozen import FrozenScene
 from cadence.network.scene import SceneNetworkConfig
 from cadence.training.scene import Dropout, diffusion_loss, energy_loss, scene_windows
 from cadence.types import Context, Detections, WindowBatch
@@ -135,6 +136,24 @@ def test_a_windows_draws_do_not_depend_on_its_neighbours_or_chunks() -> None:
     pick = torch.tensor([2])
     alone = estimator.placed(cut.context[pick]).sample(cut.windows[pick], 4).position_m
     assert torch.allclose(alone, whole[2:], atol=0.05)
+
+
+def test_laid_out_for_sampling_agents_see_each_other_as_in_the_network() -> None:
+    cut, estimator = windows(), model(TOGETHER)
+    rows = agent_rows(without(cut, 1, 2), cut.context, TOGETHER)
+    inputs = scene_inputs(rows.windows, rows.context, TOGETHER)
+    frozen = FrozenScene(estimator.network)
+    noisy = torch.randn(2 * len(inputs), TOGETHER.num_pieces, 2, generator=torch.Generator().manual_seed(0))
+    twice = inputs.repeated(2)
+    assert rows.team is not None
+    team = rows.team.repeated(2)
+    with torch.no_grad():
+        code = estimator.network.encode(twice)
+        expected = estimator.network(noisy, torch.full((len(noisy),), 0.7), twice.pieces, code, team)
+        found = frozen(noisy, 0.7, twice.pieces, frozen.known(inputs), team)
+        alone = frozen(noisy, 0.7, twice.pieces, frozen.known(inputs))
+    assert torch.allclose(found, expected, atol=1e-4)
+    assert not torch.allclose(alone, expected, atol=1e-3)
 
 
 def test_shared_detections_are_those_of_all_by_time() -> None:
