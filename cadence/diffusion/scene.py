@@ -22,7 +22,7 @@ from cadence.diffusion.scene_frame import SceneConfig, future_of, scene_inputs, 
 from cadence.diffusion.scene_team import agent_rows, shared_detections
 from cadence.diffusion.schedule import MAX_ANGLE, clean_from, cosine_schedule
 from cadence.errors import ConfigError
-from cadence.network.attention import Team
+from cadence.network.attention import MAX_AGENTS, Team
 from cadence.network.frozen import FrozenScene
 from cadence.network.scene import Pieces, SceneNetwork
 from cadence.types import Context, Detections, HypothesisSet, WindowBatch
@@ -122,6 +122,11 @@ class SceneModel:
             raise ConfigError(
                 f"infer.grid: this checkpoint predicts {NUM_STEPS} steps of {step_s:g} s from now on; set step_s = {step_s:g}, "
                 f"history_steps = 1, horizon_steps = {NUM_STEPS - 1}"
+            )
+        if self.config.network.attention_heads and windows.num_agents > MAX_AGENTS:
+            raise ConfigError(
+                f"infer.checkpoint: this checkpoint draws at most {MAX_AGENTS} agents together, here are {windows.num_agents}; "
+                "choose one without attention between agents, such as 'general'"
             )
         if self.context is None or len(self.context.datum_m) != windows.num_windows:
             raise ValueError("SceneModel: the windows need a context of their own; use placed()")

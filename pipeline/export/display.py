@@ -1,5 +1,6 @@
 """How a scene looks: colours, lines for hypotheses, marks for detections, outlines for obstacles."""
 
+import colorsys
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,11 +17,24 @@ Float64s = npt.NDArray[np.float64]
 # Okabe and Ito (2008), "Color Universal Design": told apart with any colour vision; black is left out (dark backgrounds).
 PALETTE = ("#56B4E9", "#E69F00", "#009E73", "#F0E442", "#CC79A7", "#D55E00", "#0072B2")
 
+_GOLDEN_SHARE = 0.618034
+_SHADES = ((0.4, 1.0), (1.0, 0.95), (0.6, 0.5), (0.3, 0.75), (0.8, 0.75))
+"""Saturation and value of the colours after those."""
+
 _ALPHA_FLOOR, _ALPHA_TOP = 0.10, 0.65
 _FUTURE_TINT = 0.5
 _OBSTACLE_COLOR = np.array([0.75, 0.75, 0.75, 0.9])
 _MAX_MARKS = 256
 _CIRCLE_POINTS = 48
+
+
+def agent_hue(index: int) -> str:
+    """The colour #RRGGBB of agent `index`: first those of `PALETTE`, then more, each far from its neighbours on the wheel."""
+    if index < len(PALETTE):
+        return PALETTE[index]
+    more = index - len(PALETTE)
+    rgb = colorsys.hsv_to_rgb(more * _GOLDEN_SHARE % 1.0, *_SHADES[more % len(_SHADES)])
+    return "#" + "".join(f"{round(255 * value):02X}" for value in rgb)
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +60,7 @@ class Style:
 
     def hue(self, agent_id: str) -> str:
         """The colour of an agent as #RRGGBB; grey for one that was never inferred."""
-        return PALETTE[self.agent_ids.index(agent_id) % len(PALETTE)] if agent_id in self.agent_ids else "#999999"
+        return agent_hue(self.agent_ids.index(agent_id)) if agent_id in self.agent_ids else "#999999"
 
     def color(self, agent_id: str) -> Float64s:
         """Red, green, blue and alpha (0..1) of an agent: the same in the whole file."""

@@ -9,6 +9,8 @@ import torch
 from cadence.diffusion.scene import SceneModel, SceneSampling
 from cadence.diffusion.scene_frame import SceneConfig, scene_inputs
 from cadence.diffusion.scene_team import agent_rows, shared_detections
+from cadence.errors import ConfigError
+from cadence.network.attention import MAX_AGENTS
 from cadence.network.frozen import FrozenScene
 from cadence.network.scene import SceneNetworkConfig
 from cadence.training.scene import Dropout, diffusion_loss, energy_loss, scene_windows
@@ -207,3 +209,11 @@ def test_a_goal_that_is_told_goes_with_its_agent() -> None:
     assert rows.context.known_goal_m is not None
     assert torch.equal(rows.context.known_goal_m[:, 0], goal.reshape(9, 2))
     assert isinstance(rows.context, Context)
+
+
+def test_more_agents_than_can_attend_to_each_other_are_refused_in_a_line() -> None:
+    crowd = cut_windows(recordings(num=1, agents=MAX_AGENTS + 1), np.array([0]), np.array([30]))
+    with pytest.raises(ConfigError, match=f"at most {MAX_AGENTS} agents together, here are {MAX_AGENTS + 1}"):
+        model(TOGETHER).placed(crowd.context).sample(crowd.windows, 1)
+    drawn = model(ALONE).placed(crowd.context).sample(crowd.windows, 1)
+    assert drawn.position_m.shape[2] == MAX_AGENTS + 1

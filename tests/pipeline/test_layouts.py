@@ -1,8 +1,9 @@
 import json
 
+import numpy as np
 import pytest
 
-from pipeline.export.display import Style
+from pipeline.export.display import Style, agent_hue
 from pipeline.ingest import CatalogueChannel
 from pipeline.layouts import build_layout, build_legacy_layout
 from pipeline.tables import Frame
@@ -97,3 +98,11 @@ def test_form_is_that_of_the_foxglove_sdk():
             assert panel["config"].get(name, {}).keys() <= kind()._to_dict().keys()
         for series in panel["config"].get("paths", []):
             assert series.keys() <= layouts.PlotSeries()._to_dict().keys()
+
+
+def test_forty_agents_have_forty_colours_that_can_be_told_apart() -> None:
+    hues = [agent_hue(index) for index in range(40)]
+    rgb = np.array([[int(hue[i : i + 2], 16) for i in (1, 3, 5)] for hue in hues], float)
+    apart = np.linalg.norm(rgb[:, None] - rgb, axis=-1) + 1000.0 * np.eye(40)
+    assert apart.min() > 20.0
+    assert all(len(hue) == 7 for hue in hues)
