@@ -8,6 +8,7 @@ scored in blocks that are kept, so that a killed call goes on where it was.
 import dataclasses
 import functools
 import hashlib
+import itertools
 import json
 import time
 from collections.abc import Callable, Mapping
@@ -117,14 +118,15 @@ def evaluate_forecasts(
     def body(work: Path) -> Mapping[str, Any]:
         # Beside the results, not inside the working folder: what a killed call has done is to be found again.
         cache = out / "cache"
-        episodes = load_recordings(source, cache, progress)
+        together = any(draws_together(forecaster) for forecaster in forecasters.values())
+        episodes = load_recordings(source, cache, progress, together)
         windows = forecast_windows(episodes.recordings, config)
         run = ForecastRun(episodes, windows, config.num_hypotheses, cache / "scores", progress, config.obstacles)
 
         @functools.cache
         def training() -> Recordings:
             assert config.training is not None  # refused by the configuration
-            return load_recordings(config.training, cache, progress).recordings
+            return load_recordings(config.training, cache, progress).recordings.apart()
 
         scores = {
             label: run.score(label, functools.partial(_same, forecasters[label]), [checkpoint_hash(path), samplings])
@@ -136,7 +138,11 @@ def evaluate_forecasts(
         write_atomic(work / "forecast.json", as_json(report))
         write_atomic(work / "forecast.csv", as_csv(report))
         write_atomic(work / "forecast.md", as_markdown(report))
-        counts = {"num_episodes": len(episodes.recordings), "num_left_out": len(episodes.left_out), "num_windows": len(windows)}
+        counts = {
+            "num_episodes": episodes.recordings.num_episodes,
+            "num_left_out": len(episodes.left_out),
+            "num_windows": len(windows),
+        }
         return {**counts, "scores": headline(report)}
 
     if not logs:
@@ -228,24 +234,46 @@ class ForecastRun:
 
     def _score_block(self, forecaster: Forecaster, part: ForecastWindows) -> EpisodeScores:
         """The windows of episodes with the same obstacles go together."""
-        which = [id(self.episodes.obstacles[index]) for index in part.episode.tolist()]
+        which = [id(self._obstacles(index)) for index in part.episode.tolist()]
         groups = [part[torch.tensor([item == chosen for item in which])] for chosen in dict.fromkeys(which)]
         return EpisodeScores.add([self._score_group(forecaster, group) for group in groups])
 
     def _score_group(self, forecaster: Forecaster, part: ForecastWindows) -> EpisodeScores:
-        obstacles = self.episodes.obstacles[int(part.episode[0])]
+        obstacles = self._obstacles(int(part.episode[0]))
+        alone = part.apart()
+        is_known = alone.windows.is_active[:, 0]
+        alone = alone[is_known]
         begin = time.process_time()
-        estimator = forecaster.placed(part.context, obstacles if self.tells_obstacles else None)
-        found = estimator.sample(part.windows, self.num_hypotheses)
+        asked = part if draws_together(forecaster) else alone
+        estimator = forecaster.placed(asked.context, obstacles if self.tells_obstacles else None)
+        found = estimator.sample(asked.windows, self.num_hypotheses)
         seconds = time.process_time() - begin
+        if asked is part:
+            found = _agent_by_agent(found, is_known)
         num_lost = int((~torch.isfinite(found.position_m)).flatten(1).any(dim=1).sum())
         if num_lost:
             raise ConfigError(
-                f"{forecaster.name}: no position for {num_lost} of {len(part)} windows; does it need a known goal "
+                f"{forecaster.name}: no position for {num_lost} of {len(alone)} windows; does it need a known goal "
                 "or trackers that the logs do not have? See evaluate.forecast"
             )
-        paper = paper_error(estimator, part.windows, part.truth_m)
-        return score_forecasts(found, part.truth_m, part.episode, part.context.datum_m, obstacles, paper, seconds)
+        paper = paper_error(estimator, asked.windows, asked.truth_m)
+        return score_forecasts(found, alone.truth_m, alone.episode, alone.context.datum_m, obstacles, paper, seconds)
+
+    def _obstacles(self, episode: int) -> Obstacles:
+        return self.episodes.obstacles[episode * self.episodes.recordings.num_agents]
+
+
+def draws_together(forecaster: Forecaster) -> bool:
+    """Whether a forecaster draws all agents of a window together, so that it must see them in one."""
+    return bool(getattr(forecaster, "draws_together", False))
+
+
+def _agent_by_agent(found: HypothesisSet, is_known: Tensor) -> HypothesisSet:
+    """Joint hypotheses [B, K, A, T, 2] as those of single agents [R, K, 1, T, 2], where `is_known` [B * A] holds."""
+    size = found.position_m.shape[2]
+    position = found.position_m.transpose(1, 2).flatten(0, 1)[is_known, :, None]
+    status = itertools.compress(((text,) for row in found.status for text in row), is_known.tolist())
+    return HypothesisSet(position, found.weight.repeat_interleave(size, 0)[is_known], tuple(status))
 
 
 def paper_error(estimator: Estimator, windows: WindowBatch, truth_m: Tensor) -> Tensor | None:
@@ -278,6 +306,7 @@ class _Truth:
 
     windows: ForecastWindows
     name: str = "truth"
+    draws_together: bool = True
 
     def placed(self, context: Context, obstacles: Obstacles | None = None) -> Estimator:
         return self
@@ -290,13 +319,13 @@ class _Truth:
         track = self.windows.truth_m[order[torch.searchsorted(seeds, windows.seeds)]]
         weight = torch.full((len(track), num_hypotheses), 1.0 / num_hypotheses, dtype=torch.float64)
         position = track[:, None].expand(-1, num_hypotheses, -1, -1, -1)
-        return HypothesisSet(position, weight, tuple(("ok",) for _ in range(len(track))))
+        return HypothesisSet(position, weight, (("ok",) * track.shape[1],) * len(track))
 
 
 def facts_of(episodes: RecordingSet, windows: ForecastWindows, config: ForecastConfig) -> ForecastFacts:
     """What a reader of the tables must know."""
     return ForecastFacts(
-        num_episodes=len(episodes.recordings),
+        num_episodes=episodes.recordings.num_episodes,
         num_left_out=len(episodes.left_out),
         left_out=episodes.left_out,
         num_windows=len(windows),

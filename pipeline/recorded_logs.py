@@ -34,9 +34,10 @@ _JITTER = 0.01
 
 @dataclass(frozen=True, eq=False)
 class LogEpisodes:
-    """What was read of one log: an episode a target with truth, all with the same obstacles.
+    """What was read of one log: a track for each target with truth, all with the same obstacles.
 
-    names      of the episodes: the log's, with the target's where it has several
+    recordings  one episode of all targets where they have the same steps, otherwise an episode for each
+    names      of the tracks: the log's, with the target's where it has several
     scale_m    what the paper divides distances by: the longer side of the map; NaN where the log does not state it
     obstacles  the entries of obstacles.json as JSON text
     """
@@ -86,7 +87,11 @@ def read_log_episodes(path: Path, extract: ExtractConfig, gridding: Gridding) ->
         for agent in agents
     ]  # fmt: skip
     names = (path.stem,) if len(agents) == 1 else tuple(f"{path.stem}/{agent}" for agent in agents)
-    return LogEpisodes(Recordings.concatenate(parts), names, _scale_m(mission), json.dumps(entries, sort_keys=True))
+    recordings = Recordings.concatenate(parts)
+    starts = {_of_agent(truth, agent)[0][0] for agent in agents}
+    if len(starts) == 1 == len(set(recordings.length)):
+        recordings = replace(recordings, num_agents=len(agents))
+    return LogEpisodes(recordings, names, _scale_m(mission), json.dumps(entries, sort_keys=True))
 
 
 def _says_unseen(log: MissionLog, mission: Mapping[str, str], extract: ExtractConfig) -> bool:

@@ -1,4 +1,4 @@
-"""Single-target episodes as `Recordings`: a folder of mission logs with truth, or one of the paper's worlds.
+"""Episodes as `Recordings`: a folder of mission logs with truth, or one of the paper's worlds.
 
 What was read or simulated once is kept as npz in a cache folder: logs by their content, simulated episodes in blocks, so
 that a killed call goes on where it was.
@@ -80,7 +80,7 @@ class RecordingsConfig:
 class RecordingSet:
     """Episodes with what belongs to them.
 
-    names      of the tracks [E]; agents of one episode are told apart by a suffix
+    names      of the tracks [E]; targets of one log or episode are told apart by a suffix
     obstacles  of every track [E]; the same object where they are the same
     scale_m    what the paper divides distances by; None where nothing states it
     left_out   one line for each log that could not be used
@@ -97,10 +97,11 @@ class RecordingSet:
             raise ValueError("RecordingSet: as many names and obstacles as tracks are needed")
 
 
-def load_recordings(config: RecordingsConfig, cache: Path, progress: Progress) -> RecordingSet:
+def load_recordings(config: RecordingsConfig, cache: Path, progress: Progress, together: bool = False) -> RecordingSet:
     """The episodes that `config` asks for, by way of the folder `cache`.
 
-    A log that cannot be used is named and left out. Raises `InputError` where none can be used.
+    With `together` all targets of a log are one episode; all logs need the same number of them then, recorded at the same
+    steps. A log that cannot be used is named and left out. Raises `InputError` where none can be used.
     """
     if config.data is not None and config.data.suffix == ".npz":
         recordings, more = read_recordings(config.data)
@@ -109,7 +110,7 @@ def load_recordings(config: RecordingsConfig, cache: Path, progress: Progress) -
         scale_m = config.scale_m or (float(more["scale_m"]) if "scale_m" in more else None)
         return RecordingSet(recordings, names, (obstacles,) * len(recordings), scale_m)
     if config.data is not None:
-        return _of_logs(config.data, config, cache, progress)
+        return _of_logs(config.data, config, cache, progress, together)
     return _of_world(config, cache, progress)
 
 
@@ -147,7 +148,7 @@ def read_recordings(path: Path) -> tuple[Recordings, dict[str, Any]]:
         raise InputError(f"{path}: damaged ({error}); remove the file, it is made again") from error
 
 
-def _of_logs(data: Path, config: RecordingsConfig, cache: Path, progress: Progress) -> RecordingSet:
+def _of_logs(data: Path, config: RecordingsConfig, cache: Path, progress: Progress, together: bool) -> RecordingSet:
     if not data.is_dir():
         raise InputError(f"{data}: not a folder of MCAP logs with truth; check the path")
     logs = sorted(data.glob(config.pattern))
@@ -164,6 +165,8 @@ def _of_logs(data: Path, config: RecordingsConfig, cache: Path, progress: Progre
                         f"{log}: a step of {episodes.recordings.step_s:g} s, the logs before it have "
                         f"{found[0].recordings.step_s:g} s; set step_s"
                     )
+                if together:
+                    _check_together(log, episodes, found)
                 found.append(episodes)
             except CadenceError as error:
                 left_out.append(str(error))
@@ -175,12 +178,24 @@ def _of_logs(data: Path, config: RecordingsConfig, cache: Path, progress: Progre
     shared = {text: as_obstacles(json.loads(text)) for text in {part.obstacles for part in found}}
     scales = [part.scale_m for part in found if np.isfinite(part.scale_m)]
     return RecordingSet(
-        Recordings.concatenate([part.recordings for part in found]),
+        Recordings.concatenate([part.recordings if together else part.recordings.apart() for part in found]),
         tuple(name for part in found for name in part.names),
         tuple(shared[part.obstacles] for part in found for _ in part.names),
         config.scale_m or (scales[0] if scales and len(set(scales)) == 1 else None),
         tuple(left_out),
     )
+
+
+def _check_together(log: Path, episodes: LogEpisodes, before: Sequence[LogEpisodes]) -> None:
+    """`InputError` for a log whose targets are no episode like those before it."""
+    count, size = len(episodes.names), episodes.recordings.num_agents
+    if size != count:
+        raise InputError(f"{log}: its {count} targets have truth at different steps; to draw them together they need the same")
+    if before and size != before[0].recordings.num_agents:
+        raise InputError(
+            f"{log}: has {size} targets, the logs before it {before[0].recordings.num_agents}; to draw targets together "
+            "give a folder or a pattern of logs with the same number"
+        )
 
 
 def _of_log(log: Path, config: RecordingsConfig, cache: Path) -> LogEpisodes:

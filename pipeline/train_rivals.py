@@ -104,7 +104,7 @@ def train_rivals(out: Path, config: "TrainConfig", progress: Progress, force: bo
     rival = config.rival
     kept, held_out = [], []
     for source in rival.sources or (RecordingsConfig(),):
-        recordings = load_recordings(source, out / "recordings", progress).recordings
+        recordings = load_recordings(source, out / "recordings", progress).recordings.apart()
         if len(recordings) < 2:
             raise ConfigError("train.rival.sources: a source has one episode; two are needed, whole ones are for validation")
         num = min(max(1, round(rival.validation_share * len(recordings))), len(recordings) - 1)

@@ -77,8 +77,11 @@ def train_scene(out: Path, config: "TrainConfig", progress: Progress, force: boo
     """Train the scene preset into `out`; see `pipeline.train.train`."""
     scene, cache = config.scene, out / "episodes"
     model = _model_config(scene)
-    pool = load_pool(scene.sources, cache, model.step_s, "train.scene.model", progress)
-    held_out = load_pool(scene.validation, cache, model.step_s, "train.scene.model", progress)
+    together = model.network.attention_heads > 0
+    pool, held_out = (
+        load_pool(sources, cache, model.step_s, "train.scene.model", progress, together)
+        for sources in (scene.sources, scene.validation)
+    )
     with torch.random.fork_rng(devices=[]):  # layers take their first weights from the global stream, which is left as it was
         torch.random.manual_seed(config.seed)
         network = model.build()

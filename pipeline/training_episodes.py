@@ -1,4 +1,4 @@
-"""Where presets that learn one place take their windows from: recorded or simulated episodes of one target, in shares."""
+"""Where presets that learn one place take their windows from: recorded or simulated episodes, in shares."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
@@ -66,9 +66,14 @@ class EpisodePool:
         return EpisodePool(tuple(first), self.shares), EpisodePool(tuple(last), self.shares)
 
 
-def load_pool(sources: Sequence[EpisodeSource], cache: Path, step_s: float, where: str, progress: Progress) -> EpisodePool:
-    """The episodes of the sources, by way of the folder `cache`; `ConfigError` names the key `where` if steps differ."""
-    parts = tuple(load_recordings(source.episodes, cache, progress).recordings for source in sources)
+def load_pool(
+    sources: Sequence[EpisodeSource], cache: Path, step_s: float, where: str, progress: Progress, together: bool = False
+) -> EpisodePool:
+    """The episodes of the sources, by way of the folder `cache`; `together` see `load_recordings`.
+
+    `ConfigError` names the key `where` if steps differ.
+    """
+    parts = tuple(load_recordings(source.episodes, cache, progress, together).recordings for source in sources)
     if any(part.step_s != step_s for part in parts):
         raise ConfigError(f"{where}.step_s is {step_s:g} s; the episodes have another step")
     return EpisodePool(parts, tuple(source.share for source in sources))

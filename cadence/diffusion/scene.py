@@ -90,6 +90,11 @@ class SceneModel:
     obstacles: Obstacles = field(default_factory=Obstacles.none)
     name: str = "cadence"
 
+    @property
+    def draws_together(self) -> bool:
+        """Whether all agents of a window are drawn together."""
+        return self.config.network.attention_heads > 0
+
     def fit(self, tracks: Detections) -> Self:
         """The model itself: it adapts to nothing."""
         return self

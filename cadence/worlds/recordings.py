@@ -4,6 +4,7 @@ The protocol is the paper's (Ye et al., CADENCE, MRS 2023, section V): at a step
 known, and the next positions are asked for; after the episode's end the target stays where it was.
 """
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -72,6 +73,10 @@ class Recordings:
         """Steps of every track [E]."""
         return np.diff(self.offset)
 
+    def apart(self) -> "Recordings":
+        """The same tracks, each an episode of its own."""
+        return dataclasses.replace(self, num_agents=1)
+
     def rates(self) -> NDArray[np.float64]:
         """Share of steps with a detection, a track [E]."""
         return np.add.reduceat(self.is_detected.astype(np.float64), self.offset[:-1]) / self.length
@@ -139,6 +144,18 @@ class ForecastWindows:
     def __getitem__(self, pick: slice | Tensor) -> "ForecastWindows":
         """A selection of windows."""
         return ForecastWindows(self.windows[pick], self.context[pick], self.truth_m[pick], self.episode[pick], self.step[pick])
+
+    def apart(self) -> "ForecastWindows":
+        """Every agent of every window as a window of its own [B * A], the agents of a window in a row."""
+        size = self.windows.num_agents
+        window = torch.arange(len(self)).repeat_interleave(size)
+        rows = self[window]
+        d, goal = self.windows.detections, self.context.known_goal_m
+        columns = (value.flatten(0, 1)[:, None] for value in (d.time_s, d.position_m, d.covariance_m2, d.is_observed))
+        seeds = rows.windows.seeds * size + torch.arange(size).repeat(len(self))
+        context = dataclasses.replace(rows.context, known_goal_m=None if goal is None else goal.flatten(0, 1)[:, None])
+        alone = WindowBatch(self.windows.time_s, Detections(*columns), seeds, self.windows.origin_index)
+        return dataclasses.replace(rows, windows=alone, context=context, truth_m=self.truth_m.flatten(0, 1)[:, None])
 
 
 def choose_windows(

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import shutil
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ from cadence.constraints.obstacles import Obstacles
 from cadence.diffusion.absolute import AbsoluteConfig, AbsoluteSampling
 from cadence.errors import ConfigError, UsageError
 from cadence.network.trajectory import TrajectoryNetwork, TrajectoryNetworkConfig
-from cadence.types import Context, HypothesisSet, WindowBatch
+from cadence.types import Context, Detections, HypothesisSet, WindowBatch
 from pipeline import forecasts
 from pipeline.checkpoints import CheckpointInfo, save_checkpoint
 from pipeline.config import config_as_dict, read_config
@@ -121,6 +122,59 @@ def test_known_answers_through_the_whole_protocol(tmp_path: Path, known_start: b
     assert truth.mean("ade").tolist() == [0.0] * 5
     if not known_start:
         assert windows.windows.is_active.all()
+
+
+@dataclass
+class InOrder:
+    """Sees two targets in every window and answers with straight ways, those of the second 300 m beside the truth."""
+
+    draws_together = True
+    name = "in order"
+
+    def placed(self, context: Context, obstacles: Obstacles | None = None) -> "InOrder":
+        return self
+
+    def fit(self, tracks: Detections) -> "InOrder":
+        return self
+
+    def sample(self, windows: WindowBatch, num_hypotheses: int) -> HypothesisSet:
+        assert windows.num_agents == 2
+        parts = []
+        for agent, shift_m in ((0, 0.0), (1, 300.0)):
+            columns = {name: value[:, agent : agent + 1] for name, value in vars(windows.detections).items()}
+            alone = dataclasses.replace(windows, detections=Detections(**columns))
+            parts.append(Straight(shift_m).sample(alone, num_hypotheses).position_m)
+        weight = torch.full((windows.num_windows, num_hypotheses), 1.0 / num_hypotheses, dtype=torch.float64)
+        return HypothesisSet(torch.cat(parts, dim=2), weight, (("ok", "ok"),) * windows.num_windows)
+
+
+def test_targets_are_drawn_together_or_alone_and_scored_one_by_one(tmp_path: Path) -> None:
+    data = tmp_path / "pairs"
+    data.mkdir()
+    for index in range(3):
+        rows = [*of(walk(300, 100.0 * index), "A"), *of(walk(300, 100.0 * index + 1000.0), "B")]
+        write_log(data / f"log_{index}.mcap", sorted(rows, key=lambda row: row.time_s))
+    episodes = load_recordings(RecordingsConfig(data=data), tmp_path / "read", QUIET, together=True)
+    assert episodes.recordings.num_episodes == 3 and episodes.recordings.num_agents == 2
+    windows = forecast_windows(episodes.recordings, SMALL)
+    run = ForecastRun(episodes, windows, 4, None, QUIET)
+    together = run.score("together", InOrder, [])
+    assert together.count.sum() == 60 and len(together.episode) == 3
+    assert together.mean("displacement_error")[0] == pytest.approx(150.0, rel=1e-5)
+    alone = run.score("alone", lambda: Anywhere(Straight(300.0)), [])
+    assert alone.mean("displacement_error")[0] == pytest.approx(300.0, rel=1e-5)
+    assert truth_scores(episodes, windows).mean("ade").tolist() == [0.0] * 5
+
+
+def of(rows: list[Row], agent_id: str) -> list[Row]:
+    """A walk with a name of its own."""
+    is_truth = [row.topic.startswith("/truth") for row in rows]
+    return [
+        dataclasses.replace(row, topic=f"/truth/{agent_id}")
+        if true
+        else dataclasses.replace(row, message=row.message | {"agent_id": agent_id})
+        for row, true in zip(rows, is_truth, strict=True)
+    ]
 
 
 def test_obstacles_are_told_and_differ_by_episode(tmp_path: Path) -> None:

@@ -67,8 +67,22 @@ def folder(tmp_path: Path) -> Path:
     return data
 
 
-def load(data: Path, **changes: object):
-    return load_recordings(RecordingsConfig(data=data, **changes), data.parent / "cache", QUIET)  # type: ignore[arg-type]
+def load(data: Path, *, together: bool = False, **changes: object):
+    config = RecordingsConfig(data=data, **changes)  # type: ignore[arg-type]
+    return load_recordings(config, data.parent / "cache", QUIET, together)
+
+
+def pair(num_targets: int = 2, start: int = 0) -> list[Row]:
+    """Targets that go 100 m east a step beside each other, six steps; the last one from step `start` on."""
+    last = num_targets - 1
+    rows = [
+        pose(60.0 * k, 100.0 * k, 100.0 * i, f"/truth/T{i}")
+        for k in range(6)
+        for i in range(num_targets)
+        if i < last or k >= start
+    ]
+    seen = [detection(60.0 * (i + 2), 100.0 * (i + 2), 100.0 * i, agent_id=f"T{i}") for i in range(num_targets)]
+    return sorted([*rows, *seen], key=lambda row: row.time_s)
 
 
 def test_a_folder_of_logs_becomes_episodes(folder: Path) -> None:
@@ -130,12 +144,25 @@ def test_an_episode_in_which_nothing_was_seen_counts(folder: Path, says: str) ->
 
 
 def test_several_targets_are_episodes_of_their_own(tmp_path: Path) -> None:
-    rows = [pose(60.0 * k, 100.0 * k, 100.0 * i, f"/truth/T{i}") for k in range(6) for i in range(2)]
-    rows += [detection(60.0, 100.0, 100.0, agent_id="T1"), detection(120.0, 200.0, 0.0, agent_id="T0")]
-    write_log(tmp_path / "pair.mcap", rows)
+    write_log(tmp_path / "pair.mcap", pair())
     found = load(tmp_path)
-    assert found.names == ("pair/T0", "pair/T1")
-    assert np.flatnonzero(found.recordings.is_detected).tolist() == [2, 7]
+    assert found.names == ("pair/T0", "pair/T1") and found.recordings.num_episodes == 2
+    assert np.flatnonzero(found.recordings.is_detected).tolist() == [2, 9]
+
+
+def test_targets_of_a_log_are_one_episode_where_they_are_to_be_drawn_together(tmp_path: Path) -> None:
+    data = tmp_path / "logs"
+    data.mkdir()
+    for name in ("a", "b"):
+        write_log(data / f"{name}.mcap", pair())
+    write_log(data / "late.mcap", pair(start=1))
+    write_log(data / "more.mcap", pair(num_targets=3))
+    found = load(data, together=True)
+    assert found.names == ("a/T0", "a/T1", "b/T0", "b/T1") and found.recordings.num_episodes == 2
+    late, more = found.left_out
+    assert "late.mcap: its 2 targets have truth at different steps" in late
+    assert "more.mcap: has 3 targets, the logs before it 2" in more
+    assert load(data).recordings.num_episodes == 2 + 2 + 2 + 3
 
 
 @pytest.mark.parametrize(
