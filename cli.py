@@ -16,6 +16,7 @@ from pipeline.progress import Progress
 from pipeline.summaries import batch_summary, log_record, stage_summary, to_json
 
 EXIT_INTERRUPTED = 130
+_COMBINED = ["export.combined=true"]
 
 app = typer.Typer(
     name="cadence",
@@ -60,6 +61,7 @@ Config = Annotated[
 Set = Annotated[
     list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="One setting, as in infer.num_hypotheses=50; repeatable.")
 ]
+Combined = Annotated[bool, typer.Option("--combined", help="Also write one file that holds the log and the results.")]
 Force = Annotated[bool, typer.Option("--force", help="Do it again even where nothing has changed.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress on stderr; errors only.")]
 Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON on stdout.")]
@@ -118,14 +120,15 @@ def doctor(logs: Logs, quiet: Quiet = False, as_json: Json = False) -> int:
 @app.command()
 def run(
     logs: Logs, out: RunOut, workers: Workers = None, engine: Engine = "local", start: Start = None, end: End = None,
-    topic: Topic = None, report: Report = None, config: Config = None, settings: Set = None, seed: Seed = None,
-    force: Force = False, quiet: Quiet = False, as_json: Json = False,
+    topic: Topic = None, combined: Combined = False, report: Report = None, config: Config = None, settings: Set = None,
+    seed: Seed = None, force: Force = False, quiet: Quiet = False, as_json: Json = False,
 ) -> int:  # fmt: skip
     """Run all stages on every log.
 
     Ingest, extract, infer, export, report; finished stages are skipped. Folders are searched for logs, parts of a split
     recording are one mission. Each gets the mission directory DIR/<its name>; what became of all is in DIR/batch.json.
     One bad log does not stop the others; the exit code is the highest of the failures, or 7 where only damaged logs are amiss.
+    That nothing was detected in a log is no failure, unless nothing was detected in any of them (3).
 
     \b
     Examples:
@@ -135,17 +138,16 @@ def run(
       cadence run s3://fleet/2026-11 --out s3://fleet/tracks --engine ray
       cadence run flight.mcap --out results --set infer.num_hypotheses=50 --seed 7
     """
-    from pipeline.batch import RunConfig, exit_code
+    from pipeline.batch import RunConfig, complaints, exit_code
     from pipeline.run import run as run_all
     from pipeline.run import selection_settings
 
-    chosen = [*(settings or ()), *selection_settings(start, end, topic or ())]
+    chosen = [*(settings or ()), *_COMBINED * combined, *selection_settings(start, end, topic or ())]
     resolved = stage_config(RunConfig, None, config, chosen, seed)
     outcomes = run_all(logs, out, resolved, Progress(quiet), force, engine, workers, report)
     typer.echo(to_json([log_record(outcome) for outcome in outcomes]) if as_json else batch_summary(outcomes))
-    for outcome in outcomes:
-        if outcome.exit_code:
-            _complain(outcome.message)
+    for complaint in complaints(outcomes):
+        _complain(complaint)
     return exit_code(outcomes)
 
 
@@ -208,8 +210,8 @@ def infer(
 
 @app.command()
 def export(
-    mission: Mission, config: Config = None, settings: Set = None, force: Force = False, quiet: Quiet = False,
-    as_json: Json = False,
+    mission: Mission, combined: Combined = False, config: Config = None, settings: Set = None, force: Force = False,
+    quiet: Quiet = False, as_json: Json = False,
 ) -> None:  # fmt: skip
     """Stage 4: write the files for Foxglove.
 
@@ -217,12 +219,13 @@ def export(
 
     \b
     Example:
-      cadence export results/flight
+      cadence export results/flight --combined
     """
     from pipeline.export import ExportConfig
     from pipeline.export import export as stage
 
-    _show(stage(mission, stage_config(ExportConfig, "export", config, settings or ()), Progress(quiet), force), as_json)
+    resolved = stage_config(ExportConfig, "export", config, [*(settings or ()), *_COMBINED * combined])
+    _show(stage(mission, resolved, Progress(quiet), force), as_json)
 
 
 @app.command()

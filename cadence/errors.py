@@ -23,6 +23,10 @@ class InputError(CadenceError):
     exit_code = 3
 
 
+class NothingDetectedError(InputError):
+    """A log can be used, but nothing was detected in it: there is nothing to infer from."""
+
+
 class ConfigError(CadenceError):
     """A configuration, mapping or checkpoint does not fit: unknown key, wrong type, wrong shape."""
 

@@ -6,14 +6,13 @@ Where tasks run is decided by an engine (`pipeline/engines`).
 import contextlib
 import time
 import traceback
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
 
 import torch
 
-from cadence.errors import CadenceError, DeviceError, PartialInputError
+from cadence.errors import CadenceError, DeviceError, NothingDetectedError, PartialInputError
 from pipeline.export import ExportConfig, export
 from pipeline.extract import ExtractConfig, extract
 from pipeline.infer import InferConfig, infer
@@ -23,11 +22,10 @@ from pipeline.manifest import StageResult
 from pipeline.missions import find_missions
 from pipeline.progress import Progress, Told
 from pipeline.report import ReportConfig, report
+from pipeline.summaries import Status
 from pipeline.urls import shown
 
 STAGES = ("ingest", "extract", "infer", "export", "report")
-
-Status = Literal["done", "skipped", "partial", "failed"]
 
 
 @dataclass(frozen=True)
@@ -74,8 +72,9 @@ class LogOutcome:
     """What became of one log.
 
     stages     results in the order of the pipeline, up to the first failure
-    message    why it failed, in one line; else empty
-    exit_code  of the failure: 1 marks a defect of this program, whose traceback is in `trace`; 0 where it went through
+    message    why there are no results, in one line; else empty
+    exit_code  of the failure: 1 marks a defect of this program, whose traceback is in `trace`; 0 where it went through, or
+               nothing was detected in a log that is whole
     elapsed_s  how long it took
     """
 
@@ -88,10 +87,10 @@ class LogOutcome:
 
     @property
     def status(self) -> Status:
-        """failed; partial: results rest on a damaged log; skipped: all was done before; done."""
-        if self.exit_code:
-            return "failed"
-        if any(stage.summary.get("is_complete") is False for stage in self.stages):
+        """failed; nothing detected: no results; partial: they rest on a damaged log; skipped: all was done before; done."""
+        if self.message:
+            return "failed" if self.exit_code else "nothing detected"
+        if _is_damaged(self.stages):
             return "partial"
         return "skipped" if all(stage.status == "skipped" for stage in self.stages) else "done"
 
@@ -125,6 +124,8 @@ def run_task(task: LogTask, progress: Progress) -> LogOutcome:
         with _threads(1), locked(Path(task.directory), progress.note):
             for number, stage in enumerate(_RUNS):
                 finished.append(stage(task, progress.part(number / len(_RUNS), (number + 1) / len(_RUNS))))
+    except NothingDetectedError as error:  # of a damaged log nobody knows: detections may be lost
+        message, code = _naming(task, str(error)), error.exit_code * _is_damaged(finished)
     except CadenceError as error:
         message, code = _naming(task, str(error)), error.exit_code
     except MemoryError:
@@ -151,9 +152,26 @@ def run_tasks(
 
 
 def exit_code(outcomes: Sequence[LogOutcome]) -> int:
-    """0 where every log went through, else the highest code of the failures; without any, 7 where a log is damaged."""
-    is_partial = any(outcome.status == "partial" for outcome in outcomes)
-    return max((outcome.exit_code for outcome in outcomes), default=0) or PartialInputError.exit_code * is_partial
+    """The highest code of the failures; without any, 7 where a log is damaged, 3 where nothing was detected in any; else 0."""
+    if any(outcome.exit_code for outcome in outcomes):
+        return max(outcome.exit_code for outcome in outcomes)
+    if any(outcome.status == "partial" for outcome in outcomes):
+        return PartialInputError.exit_code
+    return NothingDetectedError.exit_code if _is_nothing_detected(outcomes) else 0
+
+
+def complaints(outcomes: Sequence[LogOutcome]) -> list[str]:
+    """A line for each failure; that nothing was detected in a log is one only where nothing was detected in any."""
+    return [outcome.message for outcome in outcomes if outcome.exit_code or _is_nothing_detected(outcomes)]
+
+
+def _is_damaged(stages: Iterable[StageResult]) -> bool:
+    """Whether one of the stages worked on a log of which a part is lost."""
+    return any(stage.summary.get("is_complete") is False for stage in stages)
+
+
+def _is_nothing_detected(outcomes: Sequence[LogOutcome]) -> bool:
+    return all(outcome.status == "nothing detected" for outcome in outcomes)
 
 
 def _naming(task: LogTask, message: str) -> str:

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
-from cadence.errors import ConfigError, InputError
+from cadence.errors import ConfigError, InputError, NothingDetectedError
 from pipeline.collapse import Collapsed, collapse
 from pipeline.ingest import CATALOGUE_NAME, open_catalogued_log, read_catalogue
 from pipeline.logs.reader import MissionLog
@@ -93,7 +93,10 @@ class ExtractConfig:
 
 
 def extract(directory: Path, config: ExtractConfig, progress: Progress, force: bool = False) -> StageResult:
-    """Write the tables of the log that `directory` was ingested from. Raises `InputError` where no detection is left."""
+    """Write the tables of the log that `directory` was ingested from.
+
+    Raises `InputError` where no detection is left, of which `NothingDetectedError` where none was recorded.
+    """
     catalogue = read_catalogue(directory)
 
     def body(work: Path) -> dict[str, Any]:
@@ -144,7 +147,7 @@ def _about(log: MissionLog) -> Iterator[None]:
     try:
         yield
     except InputError as error:
-        raise InputError(f"{log.path}: {error}") from error
+        raise type(error)(f"{log.path}: {error}") from error
 
 
 def _cut_ns(log: MissionLog, config: ExtractConfig) -> tuple[int | None, int | None]:
@@ -208,9 +211,9 @@ def _check_any(role: str, rows: Positions, counts: Counter[str]) -> None:
     elif counts["incomplete"]:
         reason = "no message of the mapped topics has a position where the mapping looks for it; correct the [extract] entries"
     elif counts["outside_time_cut"]:
-        reason = "no message of the mapped topics lies inside extract.start and extract.end; widen them"
+        raise NothingDetectedError("no message of the mapped topics lies inside extract.start and extract.end; widen them")
     else:
-        reason = f"the topics mapped as {role} hold no message; map another topic (cadence info lists them)"
+        raise NothingDetectedError(f"the topics mapped as {role} hold no position; map another topic (cadence info lists them)")
     raise InputError(reason)
 
 

@@ -82,12 +82,13 @@ def _run(task: LogTask, progress: Progress) -> LogOutcome:
         _forget_receipt(task.directory)
         if is_published:
             _publish(home, task.directory, files, sorted(earlier - set(files)), receipt, progress.part(_COMPUTED, 1.0))
-        if not outcome.exit_code:
-            _write_receipt(task.directory, key, outcome, files)
+        told = _told(outcome, task, here)
+        if not told.exit_code:
+            _write_receipt(task.directory, key, told, files)
         shutil.rmtree(home / SOURCE_NAME, ignore_errors=True)
         if is_published:
             shutil.rmtree(home, ignore_errors=True)
-    return _told(outcome, task, here)
+    return told
 
 
 def _sources(task: LogTask) -> list[dict[str, Any]]:
@@ -233,12 +234,13 @@ def _write_receipt(directory: str, key: Mapping[str, Any], outcome: LogOutcome, 
         {"stage": stage.stage, "outputs": [Path(path).name for path in stage.outputs], "summary": stage.summary}
         for stage in outcome.stages
     ]
-    content = {**key, "files": entries, "stages": stages}
+    content = {**key, "files": entries, "stages": stages, "message": outcome.message}
     write_text(f"{directory}/{RECEIPT_NAME}", json.dumps(content, indent=1, sort_keys=True) + "\n")
 
 
 def _skipped(task: LogTask, receipt: Mapping[str, Any]) -> LogOutcome:
-    return LogOutcome(task, tuple(_stage(task, "skipped", **entry) for entry in receipt["stages"]))
+    stages = tuple(_stage(task, "skipped", **entry) for entry in receipt["stages"])
+    return LogOutcome(task, stages, message=receipt.get("message", ""))
 
 
 def _told(outcome: LogOutcome, task: LogTask, here: LogTask) -> LogOutcome:

@@ -3,7 +3,7 @@
 import fnmatch
 from collections.abc import Mapping, Sequence
 
-from cadence.errors import ConfigError, InputError
+from cadence.errors import ConfigError, InputError, NothingDetectedError
 from pipeline.logs.reader import Channel
 from pipeline.mapping import SuggestedMapping, dense_sources, describe_channels, suggest_mapping
 from pipeline.positions import ChannelReader
@@ -12,6 +12,8 @@ from pipeline.sources import SourceConfig
 from pipeline.thinning import ThinningConfig
 
 ROLES = ("detections", "truth", "poses")
+_OTHER_ROLES = ("truth", "poses", "tf", "obstacles")
+"""Of channels that are known not to hold detections; many recorders write a channel only with its first message."""
 
 
 Sources = Mapping[str, tuple[SourceConfig, ...]]
@@ -35,7 +37,8 @@ def select_readers(
     """A reader for every channel of every role; with `suggest`, the names of topics fill the roles that the user left empty.
 
     Raises `ConfigError` where a stated topic is not in the log or its schema needs paths, `InputError` where nothing can
-    serve as detections; both name the channels and what to write.
+    serve as detections, `NothingDetectedError` where the channels tell that nothing was detected; all name the channels and
+    what to write.
     """
     suggested = suggest_mapping(channels)
     taken = _topics([source for sources in stated.values() for source in sources], channels)
@@ -50,7 +53,9 @@ def select_readers(
             chosen["poses"] = _untaken(chosen["poses"], channels, _topics(chosen["truth"], channels))
         chosen["detections"] = ()
     elif not chosen["detections"]:
-        raise InputError(_no_detections(suggested, channels))
+        is_known = all(suggested.roles.get(channel.topic) in _OTHER_ROLES for channel in channels)
+        failure = NothingDetectedError if is_known or _are_silent(suggested, channels) else InputError
+        raise failure(_no_detections(suggested, channels))
     readers = []
     for role in ROLES:
         for source in chosen[role]:
@@ -93,11 +98,22 @@ def _readers(role: str, source: SourceConfig, is_stated: bool, channels: Sequenc
     return [ChannelReader(channel, source, role, is_stated, found) for channel, found in named]
 
 
+def _named(suggested: SuggestedMapping, channels: Sequence[Channel]) -> list[Channel]:
+    """The channels whose names tell of detections."""
+    return [channel for channel in channels if suggested.roles.get(channel.topic) == "detections"]
+
+
+def _are_silent(suggested: SuggestedMapping, channels: Sequence[Channel]) -> bool:
+    """Whether there are channels of detections, all of a known type, on which nothing was recorded."""
+    named = _named(suggested, channels)
+    return bool(named) and all(preset_for(channel.schema_name) is not None for channel in named)
+
+
 def _no_detections(suggested: SuggestedMapping, channels: Sequence[Channel]) -> str:
     """One line: what is there, and the lines that would make detections of it."""
-    named = [channel for channel in channels if suggested.roles.get(channel.topic) == "detections"]
+    named = _named(suggested, channels)
     unread = sorted({channel.topic for channel in named if preset_for(channel.schema_name) is None})
-    if named and not unread:
+    if _are_silent(suggested, channels):
         return f"no message was recorded on {describe_channels(named)}; name other topics under [[extract.detections]]"
     if unread:
         paths = 'add [[extract.detections]] with topic, x = "path", y = "path" (or latitude, longitude)'

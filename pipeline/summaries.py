@@ -4,7 +4,7 @@ import dataclasses
 import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 from pipeline.manifest import StageResult
 from pipeline.urls import shown
@@ -17,6 +17,9 @@ SHOWN_STAGES = ("export", "report")
 
 MAX_LOGS_WITH_FILES = 3
 """With more logs than this the files of each are not listed."""
+
+Status = Literal["done", "skipped", "partial", "nothing detected", "failed"]
+"""What became of a log; batch.json counts each."""
 
 BATCH_VERSION = 1
 """Version of batch.json."""
@@ -53,7 +56,7 @@ def log_record(outcome: "LogOutcome") -> dict[str, Any]:
     task = outcome.task
     return {
         "log": task.log, "parts": tuple(map(shown, task.parts)), "directory": shown(task.directory),
-        "status": outcome.status, "error": error, "size_bytes": task.size_bytes,
+        "status": outcome.status, "message": outcome.message, "error": error, "size_bytes": task.size_bytes,
         "elapsed_s": round(outcome.elapsed_s, 3), "stages": outcome.stages,
     }  # fmt: skip
 
@@ -66,7 +69,7 @@ def batch_record(outcomes: Sequence["LogOutcome"], exit_code: int, elapsed_s: fl
         "exit_code": exit_code,
         "elapsed_s": round(elapsed_s, 3),
         "num_logs": len(outcomes),
-        **{f"num_{status}": counts[status] for status in ("done", "skipped", "partial", "failed")},
+        **{f"num_{status.replace(' ', '_')}": counts[status] for status in get_args(Status)},
         "logs": [log_record(outcome) for outcome in outcomes],
     }
 

@@ -11,15 +11,16 @@ import pyarrow.compute as pc
 import pytest
 from small_logs import START_NS, Row, detection, fix, pose, write_log
 
-from cadence.errors import CadenceError, ConfigError, InputError
+from cadence.errors import CadenceError, ConfigError, InputError, NothingDetectedError
 from pipeline.config import read_config
 from pipeline.extract import ExtractConfig, extract, write_tables
 from pipeline.ingest import IngestConfig, ingest
 from pipeline.logs.reader import Channel, open_log
 from pipeline.mapping import suggest_mapping
 from pipeline.progress import Progress
-from pipeline.selection import _no_detections
+from pipeline.selection import ROLES, _no_detections, select_readers
 from pipeline.tables import Frame, read_table
+from pipeline.thinning import ThinningConfig
 from schemas.tables import DETECTIONS, POSES, TRUTH
 
 DATA = Path(__file__).resolve().parents[2].parent / "shared" / "data"
@@ -222,7 +223,7 @@ def test_time_cut(tmp_path: Path, start: float | str, end: float | str) -> None:
 
 
 def test_time_cuts_that_leave_nothing_or_make_no_sense(tmp_path: Path) -> None:
-    fails(mk(tmp_path / "a"), line(), InputError, r"inside extract\.start and extract\.end", start=100.0)
+    fails(mk(tmp_path / "a"), line(), NothingDetectedError, r"inside extract\.start and extract\.end", start=100.0)
     fails(mk(tmp_path / "b"), line(), ConfigError, r"extract\.start 3.0 lies after extract\.end 1.0", start=3.0, end=1.0)
     fails(mk(tmp_path / "c"), line(), ConfigError, "extract: start = 'noon': expected seconds after", start="noon")
 
@@ -287,6 +288,28 @@ EMPTY = Channel(1, "/contacts/A", "json", "foxglove.LocationFix", "jsonschema", 
 def mk(folder: Path) -> Path:
     folder.mkdir()
     return folder
+
+
+@pytest.mark.parametrize(
+    ("channels", "is_known"),
+    [
+        ([("/contacts/A", "foxglove.LocationFix")], True),  # opened, but nothing was recorded on it
+        ([("/truth/A", "foxglove.PoseInFrame"), ("/boat/pose", "foxglove.PoseInFrame")], True),  # it was not even opened
+        ([("/truth/A", "foxglove.PoseInFrame"), ("/camera", "my.Image")], False),
+        ([("/a", "sensor_msgs/msg/NavSatFix")], False),
+        ([("/detections", "my.Own")], False),
+    ],
+)
+def test_whether_nothing_was_detected_or_nothing_is_understood(channels: list[tuple[str, str]], is_known: bool) -> None:
+    found = [dataclasses.replace(EMPTY, topic=topic, schema_name=name) for topic, name in channels]
+    with pytest.raises(InputError) as caught:
+        select_readers(dict.fromkeys(ROLES, ()), True, ThinningConfig(), found)
+    assert isinstance(caught.value, NothingDetectedError) == is_known
+
+
+def test_arrays_without_detections_are_no_fault(tmp_path: Path) -> None:
+    silent = [Row("/detections", "vision_msgs/Detection3DArray", float(i), {"detections": []}) for i in range(3)]
+    fails(tmp_path, silent, NothingDetectedError, "the topics mapped as detections hold no position")
 
 
 def test_nothing_to_detect(tmp_path: Path) -> None:

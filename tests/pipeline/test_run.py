@@ -6,14 +6,15 @@ from pathlib import Path
 import pytest
 
 import pipeline.batch as module
-from cadence.errors import DeviceError, InputError, UsageError
-from pipeline.batch import RunConfig, exit_code
+from cadence.errors import DeviceError, InputError, NothingDetectedError, UsageError
+from pipeline.batch import RunConfig, complaints, exit_code
 from pipeline.config import stage_config
 from pipeline.extract import ExtractConfig
 from pipeline.manifest import StageResult
 from pipeline.missions import mission_directories
 from pipeline.progress import Progress
 from pipeline.run import run, selection_settings
+from pipeline.summaries import batch_summary
 
 QUIET = Progress(quiet=True)
 STAGES = ("ingest", "extract", "infer", "export", "report")
@@ -105,6 +106,26 @@ def test_results_from_a_damaged_log_have_a_code_of_their_own_below_that_of_failu
     assert [outcome.status for outcome in outcomes] == ["done", "partial"] and exit_code(outcomes) == 7
     calls.failing = {("infer", "a"): InputError("a.mcap: no")}
     assert exit_code(run_here("ab", tmp_path)) == 3
+
+
+def test_that_nothing_was_detected_is_a_failure_only_where_it_is_so_of_all(calls, tmp_path):
+    calls.failing = {("extract", "b"): NothingDetectedError("b.mcap: no sighting")}
+    outcomes = run_here("ab", tmp_path)
+    assert [outcome.status for outcome in outcomes] == ["done", "nothing detected"]
+    assert exit_code(outcomes) == 0 and complaints(outcomes) == []
+    assert batch_summary(outcomes).endswith("b.mcap: no sighting") and "b    nothing detected" in batch_summary(outcomes)
+    record = json.loads((tmp_path / "batch.json").read_text())
+    assert (record["num_done"], record["num_nothing_detected"], record["num_failed"]) == (1, 1, 0)
+    assert (record["logs"][1]["message"], record["logs"][1]["error"]) == ("b.mcap: no sighting", None)
+    alone = run_here("b", tmp_path)
+    assert exit_code(alone) == 3 and complaints(alone) == ["b.mcap: no sighting"]
+
+
+def test_where_a_damaged_log_holds_no_detection_they_may_be_lost(calls, tmp_path):
+    calls.failing = {("extract", "b"): NothingDetectedError("b.mcap: no sighting")}
+    calls.summaries = {("ingest", "b"): {"is_complete": False}}
+    outcomes = run_here("ab", tmp_path)
+    assert outcomes[1].status == "failed" and exit_code(outcomes) == 3 and complaints(outcomes) == ["b.mcap: no sighting"]
 
 
 def test_no_log_is_a_wrong_call(tmp_path):
