@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from cadence.errors import InputError, UsageError
-from pipeline.logs.parts import group_parts, mission_name
-from pipeline.storage import StoredObject, find_objects
+from cadence.errors import CadenceError, InputError, UsageError
+from pipeline.logs.parts import METADATA_NAME, group_parts, mission_name, named_parts
+from pipeline.storage import StoredObject, find_objects, read_bytes
 from pipeline.urls import is_url, shown, url_name
 
 _OWN_ENDINGS: Final = (".cadence.mcap", ".combined.mcap")
@@ -40,7 +40,7 @@ def find_missions(logs: Sequence[str], out: str) -> tuple[Mission, ...]:
     texts = [text.removeprefix("file://") for text in logs]
     paths = [path for text in texts if not is_url(text) for path in _paths(text)]
     sizes = {found.url: found.size_bytes for text in texts if is_url(text) for found in _objects(text)}
-    groups = [*(tuple(map(str, group)) for group in group_parts(paths)), *((url,) for url in sizes)]
+    groups = [*(tuple(map(str, group)) for group in group_parts(paths)), *_group_objects(list(sizes))]
     sizes |= {str(path): path.stat().st_size for path in map(Path, itertools.chain(*groups)) if path.is_file()}
     return tuple(
         Mission(group, directory, sum(sizes.get(part, 0) for part in group))
@@ -80,11 +80,46 @@ def _paths(text: str) -> Iterator[Path]:
 
 
 def _objects(url: str) -> tuple[StoredObject, ...]:
-    """The logs that a URL means: an object, all below a prefix, or what fits a pattern."""
-    found = find_objects(url, _is_log_name)
-    if not found:
+    """The logs that a URL means: an object, all below a prefix, or what fits a pattern; and `metadata.yaml` beside them."""
+    found = find_objects(url, lambda name: _is_log_name(name) or name.rpartition("/")[2] == METADATA_NAME)
+    if all(each.name == METADATA_NAME for each in found):
         raise InputError(f"{shown(url)}: holds no MCAP log; check the URL")
     return found
+
+
+def _group_objects(urls: Sequence[str]) -> list[tuple[str, ...]]:
+    """The missions among logs in stores, with their parts as in `group_parts`.
+
+    Where the listing of a folder holds `metadata.yaml`, every part that it names belongs to the mission: one that is not in
+    the store fails it, rather than be missed by nobody.
+    """
+    logs = [url for url in urls if url_name(url) != METADATA_NAME]
+    num_logs = Counter(map(_folder, logs))
+    listed = {_folder(url) for url in urls if url_name(url) == METADATA_NAME}
+    named = {folder: _named_in(folder, folder in listed) for folder in num_logs if num_logs[folder] > 1 or folder in listed}
+    groups: dict[str, dict[str, str]] = {}
+    for url in logs:
+        is_part = url_name(url) in named.get(_folder(url), ())
+        groups.setdefault(_folder(url) if is_part else url, {})[url_name(url)] = url
+    for folder, group in groups.items():
+        absent = [name for name in named.get(folder, ()) if name not in group and folder in listed]
+        group |= {name: f"{folder}/{name}" for name in absent if _is_log_name(name)}
+    return [tuple(group[name] for name in named.get(folder, group) if name in group) for folder, group in groups.items()]
+
+
+def _folder(url: str) -> str:
+    """What a URL stands in; of a web address with a query, which may be good for one object only, the address itself."""
+    return url.rpartition("/")[0] if shown(url) == url else url
+
+
+def _named_in(folder: str, is_listed: bool) -> list[str]:
+    """The parts that `metadata.yaml` in a folder of a store names; empty where there is none."""
+    try:
+        return named_parts(read_bytes(f"{folder}/{METADATA_NAME}").decode("utf-8", "replace"))
+    except CadenceError:  # a store that does not let us look whether there is one has none
+        if is_listed:
+            raise
+        return []
 
 
 def _some(logs: list[Path], otherwise: str) -> list[Path]:

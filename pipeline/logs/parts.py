@@ -47,6 +47,15 @@ def missing_parts(paths: Sequence[Path]) -> tuple[Path, ...]:
     return tuple(absent)
 
 
+def named_parts(text: str) -> list[str]:
+    """Names of the parts in the order of the recording, as the text of a `metadata.yaml` states them."""
+    match = _LIST.search(text)
+    lines = match[2].splitlines() if match else []
+    # Old recorders wrote the name of the folder, too; a path that leads elsewhere is not followed.
+    names = (Path(line.strip()[1:].strip().strip("'\"")).name for line in lines)
+    return list(dict.fromkeys(name for name in names if name))
+
+
 def mission_name(paths: Sequence[Path]) -> str:
     """What a mission of these parts is called: the stem of the only part, or what the numbered parts have in common."""
     stems = [path.stem for path in paths]
@@ -64,11 +73,6 @@ def _names(folder: Path) -> list[str]:
     """Names of the parts in the order of `metadata.yaml`; empty where there is none that can be read."""
     try:
         with (folder / METADATA_NAME).open(encoding="utf-8") as file:
-            text = file.read(_MAX_METADATA_BYTES)
+            return named_parts(file.read(_MAX_METADATA_BYTES))
     except (OSError, ValueError):
         return []
-    match = _LIST.search(text)
-    lines = match[2].splitlines() if match else []
-    # Old recorders wrote the name of the folder, too; a path that leads elsewhere is not followed.
-    names = (Path(line.strip()[1:].strip().strip("'\"")).name for line in lines)
-    return list(dict.fromkeys(name for name in names if name))

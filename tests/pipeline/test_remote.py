@@ -7,12 +7,14 @@ import pytest
 from logs_fixture import straight_line, write_log
 
 import pipeline.remote as module
+from cadence.errors import DeviceError
 from pipeline.batch import RunConfig, exit_code
 from pipeline.config import stage_config
+from pipeline.missions import find_missions
 from pipeline.progress import Progress
 from pipeline.remote import RECEIPT_NAME, SOURCE_NAME, run_anywhere
 from pipeline.run import run
-from pipeline.storage import list_folder, read_bytes, write_file
+from pipeline.storage import list_folder, read_bytes, remove, write_file
 
 pytest_plugins = ("s3_fixture",)
 QUIET = Progress(quiet=True)
@@ -104,6 +106,61 @@ def test_what_was_damaged_in_the_bucket_is_mended(s3, logs, tmp_path):
     after = contents("s3://sea/out/near")
     receipt = json.loads(before[RECEIPT_NAME])["files"]["hypotheses.parquet"]
     assert after["hypotheses.parquet"] == before["hypotheses.parquet"] and receipt["size_bytes"] == size
+
+
+@pytest.fixture
+def bag(s3, tmp_path):
+    """A split recording on disk and in the bucket."""
+    folder = tmp_path / "bag"
+    folder.mkdir()
+    track = straight_line(12)
+    for number, fixes in ((0, track[:4]), (1, track[4:8]), (10, track[8:])):
+        write_log(folder / f"bag_{number}.mcap", fixes)
+    names = "".join(f"    - bag_{number}.mcap\n" for number in (0, 1, 10))
+    (folder / "metadata.yaml").write_text(f"rosbag2_bagfile_information:\n  relative_file_paths:\n{names}")
+    for path in folder.iterdir():
+        write_file(path, f"s3://sea/bags/bag/{path.name}")
+    return folder
+
+
+def test_parts_in_a_bucket_are_one_mission(s3, logs, bag, tmp_path):
+    (outcome,) = remote_run("s3://sea/bags")
+    (here,) = run([str(bag)], str(tmp_path / "here"), config(), QUIET, num_workers=0)
+    assert (outcome.task.name, outcome.status, here.status) == ("bag", "done", "done")
+    assert [part.rpartition("/")[2] for part in outcome.task.parts] == ["bag_0.mcap", "bag_1.mcap", "bag_10.mcap"]
+    assert outcome.task.size_bytes == here.task.size_bytes
+    published, local = contents("s3://sea/out/bag"), contents(str(tmp_path / "here" / "bag"))
+    assert all(published[name] == local[name] for name in ("detections.parquet", "hypotheses.parquet", "windows.parquet"))
+
+
+def test_parts_in_a_bucket_are_joined_however_they_are_named(s3, bag):
+    def names(*urls):
+        return [[part.rpartition("/")[2] for part in mission.parts] for mission in find_missions(urls, "out")]
+
+    assert names("s3://sea/bags/bag/*.mcap") == [["bag_0.mcap", "bag_1.mcap", "bag_10.mcap"]]
+    assert names("s3://sea/bags/bag/bag_1.mcap", "s3://sea/bags/bag/bag_0.mcap") == [["bag_0.mcap", "bag_1.mcap"]]
+    assert names("s3://sea/bags/bag/bag_1.mcap") == [["bag_1.mcap"]]
+    write_file(bag / "bag_0.mcap", "s3://sea/bags/bag/other.mcap")
+    assert names("s3://sea/bags") == [["bag_0.mcap", "bag_1.mcap", "bag_10.mcap"], ["other.mcap"]]
+    s3.fail("GET", "metadata.yaml", status="403 Forbidden", count=9)
+    assert names("s3://sea/bags/bag/*.mcap") == [["bag_0.mcap"], ["bag_1.mcap"], ["bag_10.mcap"], ["other.mcap"]]
+    with pytest.raises(DeviceError, match=r"bag/metadata\.yaml: access denied"):
+        names("s3://sea/bags")
+
+
+def test_a_part_that_is_not_in_the_bucket_is_missed(s3, logs, bag):
+    remove("s3://sea/bags/bag/bag_1.mcap")
+    (outcome,) = remote_run("s3://sea/bags")
+    assert (outcome.exit_code, outcome.message) == (3, "s3://sea/bags/bag/bag_1.mcap: not found; check the URL")
+
+
+def test_where_nothing_was_detected_is_kept_as_the_others(s3, logs, tmp_path, monkeypatch):
+    write_file(write_log(tmp_path / "quiet.mcap", straight_line(8, topic="/truth/A")), "s3://sea/logs/quiet.mcap")
+    (first,) = remote_run("s3://sea/logs/quiet.mcap")
+    assert first.status == "nothing detected" and "s3://sea/logs/quiet.mcap: nothing looks like" in first.message
+    monkeypatch.setattr(module, "run_task", lambda task, progress: pytest.fail("computed again"))
+    (again,) = remote_run("s3://sea/logs/quiet.mcap")
+    assert (again.status, again.message) == (first.status, first.message)
 
 
 def test_a_changed_log_is_run_again(s3, logs):
