@@ -63,7 +63,7 @@ class Batch:
 
     def payloads(self) -> Iterator[bytes]:
         """The data of each message."""
-        return (self.data[begin:end] for begin, end in zip(self.begin.tolist(), self.end.tolist(), strict=True))
+        return _payloads(self.data, self.begin, self.end)
 
     def messages(self) -> Iterator[RawMessage]:
         """Each message by itself."""
@@ -73,10 +73,14 @@ class Batch:
 
 def raw_messages(channels: Mapping[int, Channel], data: bytes, rows: Rows) -> Iterator[RawMessage]:
     """The messages of `rows`, in their order; `data` are the bytes of their block, `channels` theirs by id."""
-    named = [channels[number] for number in rows.channel_id.tolist()]
+    named = map(channels.__getitem__, rows.channel_id.tolist())
     times = (rows.log_time_ns.tolist(), rows.publish_time_ns.tolist())
-    payloads = [data[begin:end] for begin, end in zip(rows.begin.tolist(), rows.end.tolist(), strict=True)]
-    return _made(named, *times, rows.sequence.tolist(), payloads)
+    return _made(named, *times, rows.sequence.tolist(), _payloads(data, rows.begin, rows.end))
+
+
+def _payloads(data: bytes, begin: npt.NDArray[np.int64], end: npt.NDArray[np.int64]) -> Iterator[bytes]:
+    """The data of messages, copied when they are asked for: a message that was let go leaves its memory to the next."""
+    return map(data.__getitem__, map(slice, begin.tolist(), end.tolist()))
 
 
 def _made(*columns: Iterable[Any]) -> Iterator[RawMessage]:

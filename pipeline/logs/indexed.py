@@ -7,6 +7,7 @@ from collections import Counter
 from pathlib import Path
 from typing import BinaryIO
 
+import numpy as np
 from mcap import records
 from mcap.opcode import Opcode
 
@@ -35,14 +36,15 @@ def _plan(file: BinaryIO, summary: Summary, statistics: records.Statistics) -> P
         if block.num_messages:
             plan.blocks.append(block)
     plan.metadata_spans = sorted(summary.metadata_spans)
+    counts = plan.counts()
     is_complete = (
         len(summary.chunks) == statistics.chunk_count
         and len(plan.channels) == statistics.channel_count
         and len(plan.schemas) == statistics.schema_count
         and len(plan.metadata_spans) == statistics.metadata_count
-        and plan.counts() == +Counter(statistics.channel_message_counts)
-        and plan.counts().keys() <= plan.channels.keys()
-        and plan.counts().total() == statistics.message_count
+        and counts == +Counter(statistics.channel_message_counts)
+        and counts.keys() <= plan.channels.keys()
+        and counts.total() == statistics.message_count
         and {channel.schema_id for channel in plan.channels.values()} <= plan.schemas.keys() | {0}
     )
     return plan if is_complete else None
@@ -53,14 +55,16 @@ def _block(file: BinaryIO, index: records.ChunkIndex) -> Block:
     file.seek(index.chunk_start_offset + index.chunk_length)
     data = file.read(index.message_index_length)
     counts: Counter[int] = Counter()
-    first, last = 2**64, -1
+    times = []
     for opcode, begin, end in walk(data):
         if opcode != Opcode.MESSAGE_INDEX:
             raise DamagedRecord("there is no message index where the chunk's index says")
         channel_id, entries = parse_message_index(data[begin:end])
         if len(entries):
             counts[channel_id] += len(entries)
-            first, last = min(first, int(entries["log_time"].min())), max(last, int(entries["log_time"].max()))
+            times.append(entries["log_time"])
+    together = np.concatenate(times) if times else np.empty(0, np.uint64)
+    first, last = (int(together.min()), int(together.max())) if times else (2**64, -1)
     if last > MAX_TIME_NS:
         raise DamagedRecord("a log time does not fit into int64")
     body = index.chunk_start_offset + HEAD.size

@@ -7,6 +7,7 @@ from typing import Literal
 
 from mcap import records
 
+from pipeline.logs.rows import Rows
 from pipeline.logs.summary import Summary
 
 
@@ -75,13 +76,14 @@ class LooseRun:
     last: int = -1
     counts: Counter[int] = field(default_factory=Counter)
 
-    def add(self, begin: int, end: int, channel_id: int, log_time: int) -> None:
-        """Take the message in the bytes [begin, end)."""
+    def add(self, begin: int, end: int, rows: Rows) -> None:
+        """Take the messages, at least one, in the bytes [begin, end)."""
         if self.begin < 0:
             self.begin = begin
         self.end = end
-        self.counts[channel_id] += 1
-        self.first, self.last = min(self.first, log_time), max(self.last, log_time)
+        self.counts.update(rows.counts())
+        first, last = rows.span_ns()
+        self.first, self.last = min(self.first, first), max(self.last, last)
 
     def block(self) -> Block:
         """The block of the records so far."""

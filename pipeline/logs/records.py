@@ -37,9 +37,12 @@ CHUNK_HEAD_BYTES: Final = 64
 """Enough for `CHUNK_HEAD`, the name of the compression and the length of the data."""
 MAX_CHUNK_BYTES: Final = 2**28
 """Largest chunk that is decompressed; recorders write a few megabytes. Reading takes about twice as much memory."""
+MESSAGE: Final = int(Opcode.MESSAGE)
+"""As a number: to look up the member of an enumeration for every record would take a third of a walk."""
 MAX_TIME_NS: Final = 2**63 - 1
 """Latest log time that can be used: times are int64 everywhere else (the year 2262)."""
 
+_MESSAGE_INDEX_HEAD: Final = struct.Struct("<HI")
 _FOREIGN = (
     McapError, ValueError, struct.error, zstandard.ZstdError, RuntimeError, EOFError, OverflowError, MemoryError,
 )  # fmt: skip
@@ -127,11 +130,11 @@ def parse_chunk(body: bytes) -> PackedChunk:
 
 def parse_message_index(body: bytes) -> tuple[int, npt.NDArray[np.void]]:
     """Channel id and entries (`INDEX_ENTRY`) of the MessageIndex record with this body."""
-    with damage():
-        channel_id, length = struct.unpack_from("<HI", body)
-    if length != len(body) - 6 or length % INDEX_ENTRY.itemsize:
+    head = _MESSAGE_INDEX_HEAD.size
+    channel_id, length = _MESSAGE_INDEX_HEAD.unpack_from(body) if len(body) >= head else (0, -1)
+    if length != len(body) - head or length % INDEX_ENTRY.itemsize:
         raise DamagedRecord("the lengths in a message index contradict each other")
-    return channel_id, np.frombuffer(body, INDEX_ENTRY, offset=6)
+    return channel_id, np.frombuffer(body, INDEX_ENTRY, offset=head)
 
 
 def unpack_chunk(chunk: PackedChunk) -> bytes:
@@ -192,13 +195,14 @@ def walk(data: bytes, is_cut: bool = False) -> Iterator[tuple[int, int, int]]:
 
     Raises `DamagedRecord` where the next one cannot be a record, or stops there if the data are known to be cut off.
     """
+    unpack, head, least = HEAD.unpack_from, HEAD.size, MESSAGE_HEAD.size  # looked up once: this loop takes every record
     position, size = 0, len(data)
     while position < size:
-        opcode, length = HEAD.unpack_from(data, position) if position + HEAD.size <= size else (0, 0)
-        begin = position + HEAD.size
+        begin = position + head
+        opcode, length = unpack(data, position) if begin <= size else (0, 0)
         position = begin + length
         # Opcode 0 does not exist; without this test megabytes of zeros would be walked nine bytes at a time.
-        if opcode == 0 or position > size or (opcode == Opcode.MESSAGE and length < MESSAGE_HEAD.size):
+        if opcode == 0 or position > size or (opcode == MESSAGE and length < least):
             if is_cut:
                 return
             raise DamagedRecord("the lengths of the records inside contradict each other")

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from mcap.opcode import Opcode
 
-from pipeline.logs.records import HEAD, INDEX_ENTRY, MAX_TIME_NS, MESSAGE_HEAD, DamagedRecord, walk
+from pipeline.logs.records import HEAD, INDEX_ENTRY, MAX_TIME_NS, MESSAGE, MESSAGE_HEAD, DamagedRecord, walk
 
 Index = Sequence[tuple[int, npt.NDArray[np.void]]]
 """Channel ids and entries, as `parse_message_index` gives them."""
@@ -30,6 +30,8 @@ _MESSAGE: Final = np.dtype(
 )
 _INDEX_HEAD_BYTES: Final = 6  # channel id and length of the entries
 assert _MESSAGE.itemsize == HEAD.size + MESSAGE_HEAD.size
+_OPAQUE: Final = np.dtype((np.void, _MESSAGE.itemsize))
+"""The same bytes without fields: numpy gathers these ten times as fast."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,6 +68,16 @@ class Rows:
         """All rows of `parts`, in order."""
         return cls(*(np.concatenate([getattr(part, item.name) for part in parts]) for item in fields(cls)))
 
+    def counts(self) -> dict[int, int]:
+        """The number of rows by channel id."""
+        counts = np.bincount(self.channel_id)
+        ids = np.flatnonzero(counts)
+        return dict(zip(ids.tolist(), counts[ids].tolist(), strict=True))
+
+    def span_ns(self) -> tuple[int, int]:
+        """The first and the last log time; (2**64, -1) without rows."""
+        return (int(self.log_time_ns.min()), int(self.log_time_ns.max())) if len(self) else (2**64, -1)
+
     def usable(self) -> "Rows":
         """The rows whose log times fit into int64."""
         mask = self.log_time_ns <= MAX_TIME_NS
@@ -81,7 +93,18 @@ class Rows:
 def rows_by_walk(data: bytes, is_cut: bool = False) -> tuple[Rows, Definitions]:
     """Messages and definitions in the unpacked bytes of a block; raises `DamagedRecord` as `walk` does."""
     offsets, definitions = _walked(data, is_cut)
-    return _rows(data, np.array(offsets, dtype=np.int64)), definitions
+    return rows_at(data, np.array(offsets, dtype=np.int64)), definitions
+
+
+def leading_rows(data: bytes) -> tuple[Rows, int]:
+    """The whole messages that follow each other at the beginning of `data`, and how many bytes they take."""
+    offsets, length = [], 0
+    for opcode, begin, end in walk(data, is_cut=True):
+        if opcode != MESSAGE:
+            break
+        offsets.append(begin - HEAD.size)
+        length = end
+    return rows_at(data, np.array(offsets, dtype=np.int64)), length
 
 
 def rows_by_index(data: bytes, index: Index) -> tuple[Rows, Definitions] | None:
@@ -91,7 +114,7 @@ def rows_by_index(data: bytes, index: Index) -> tuple[Rows, Definitions] | None:
         return None
     order = np.argsort(offsets, kind="stable")
     begin = offsets[order].astype(np.int64)
-    heads = _heads(data)[begin]
+    heads = _heads(data, begin)
     times = np.concatenate([entries["log_time"] for _, entries in index])[order]
     ids = np.repeat([number for number, _ in index], [len(entries) for _, entries in index])[order]
     length = heads["length"]
@@ -113,16 +136,24 @@ def indexed_rows(data: bytes, index: bytes, channel_ids: Set[int]) -> Rows:
     offsets = np.sort(np.frombuffer(b"".join(named), INDEX_ENTRY)["offset"].astype(np.int64))
     if len(offsets) and not 0 <= offsets[0] <= offsets[-1] <= len(data) - _MESSAGE.itemsize:
         raise DamagedRecord("a message index points outside its chunk")
-    rows = _rows(data, offsets)
-    if not ((rows.end <= len(data)) & (rows.end >= rows.begin)).all() or not channel_ids >= set(rows.channel_id.tolist()):
+    rows = rows_at(data, offsets)
+    if not ((rows.end <= len(data)) & (rows.end >= rows.begin)).all() or not channel_ids >= rows.counts().keys():
         raise DamagedRecord("a message index differs from its chunk")
     return rows
+
+
+def agrees(rows: Rows, channel_id: int, entries: npt.NDArray[np.void]) -> bool:
+    """Whether a message index (`INDEX_ENTRY`) names the messages of its channel in a chunk, in any order."""
+    own = rows[rows.channel_id == channel_id]
+    found = np.empty(len(own), INDEX_ENTRY)
+    found["log_time"], found["offset"] = own.log_time_ns, own.begin - _MESSAGE.itemsize
+    return np.array_equal(np.sort(found), np.sort(entries))
 
 
 def _walked(data: bytes, is_cut: bool) -> tuple[list[int], Definitions]:
     offsets, definitions = [], []
     for opcode, begin, end in walk(data, is_cut):
-        if opcode == Opcode.MESSAGE:
+        if opcode == MESSAGE:
             offsets.append(begin - HEAD.size)
         elif opcode in (Opcode.CHANNEL, Opcode.SCHEMA):
             definitions.append((opcode, data[begin:end]))
@@ -145,8 +176,9 @@ def _between(data: bytes, begin: npt.NDArray[np.int64], end: npt.NDArray[np.int6
     return definitions
 
 
-def _rows(data: bytes, offsets: npt.NDArray[np.int64]) -> Rows:
-    heads = _heads(data)[offsets]
+def rows_at(data: bytes, offsets: npt.NDArray[np.int64]) -> Rows:
+    """The messages whose records begin at `offsets`; only their heads are looked at."""
+    heads = _heads(data, offsets)
     return _rows_of(heads, offsets, offsets + HEAD.size + heads["length"].astype(np.int64))
 
 
@@ -157,6 +189,7 @@ def _rows_of(heads: npt.NDArray[np.void], begin: npt.NDArray[np.int64], end: npt
     return Rows(ids, sequence, log_time, publish_time, begin + _MESSAGE.itemsize, end)
 
 
-def _heads(data: bytes) -> npt.NDArray[np.void]:
-    """The head of a message at every byte: a view with a stride of one."""
-    return np.ndarray((max(0, len(data) - _MESSAGE.itemsize + 1),), _MESSAGE, data, strides=(1,))
+def _heads(data: bytes, offsets: npt.NDArray[np.int64]) -> npt.NDArray[np.void]:
+    """The heads of the messages at these offsets, `_MESSAGE`."""
+    everywhere: npt.NDArray[np.void] = np.ndarray((max(0, len(data) - _MESSAGE.itemsize + 1),), _OPAQUE, data, strides=(1,))
+    return everywhere[offsets].view(_MESSAGE)

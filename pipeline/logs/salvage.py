@@ -7,13 +7,12 @@ plan of what is left. Chunks are decompressed one at a time and their CRCs check
 import bisect
 import struct
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
-from typing import BinaryIO, Final, TypeVar
+from typing import BinaryIO, Final
 
 import numpy as np
 import numpy.typing as npt
-from mcap import records
 from mcap.opcode import Opcode
 
 from pipeline.logs.plan import Block, LooseRun, Loss, Plan
@@ -21,10 +20,9 @@ from pipeline.logs.records import (
     CHUNK_HEAD,
     CHUNK_HEAD_BYTES,
     HEAD,
-    INDEX_ENTRY,
     MAGIC,
     MAX_CHUNK_BYTES,
-    MAX_TIME_NS,
+    MESSAGE,
     MESSAGE_HEAD,
     TEXT_MAGIC,
     DamagedRecord,
@@ -39,14 +37,14 @@ from pipeline.logs.records import (
     unpack_cut_chunk,
 )
 from pipeline.logs.resync import find_records
-from pipeline.logs.rows import Index, Rows, rows_by_index, rows_by_walk
-from pipeline.logs.summary import parse_summary_record, read_summary
+from pipeline.logs.rows import Index, Rows, agrees, leading_rows, rows_at, rows_by_index, rows_by_walk
+from pipeline.logs.summary import parse_summary_record, prefer_index, read_summary
 
 LOOSE_BLOCK_BYTES: Final = 2**20
 """Messages outside chunks are planned in stretches of about this size."""
+_MIN_WINDOW_BYTES: Final = 2**12
 _READ_BYTES: Final = 2**20
 _DATA_END: Final = struct.Struct("<BQI")
-_Definition = TypeVar("_Definition", records.Channel, records.Schema)
 _MAX_BODY_BYTES: Final = MAX_CHUNK_BYTES + CHUNK_HEAD_BYTES
 _MAX_SMALL_BYTES: Final = 2**26  # channels, schemas, metadata, message indexes; larger ones are not believed
 
@@ -71,6 +69,7 @@ class _Scanner:
         self.crc: int | None = None  # over all data so far; None where the file states none
         self.position = self.reported = 0
         self.loose = LooseRun()
+        self.window = _MIN_WINDOW_BYTES  # how far messages outside chunks are looked for at once
         self.previous = 0  # opcode of the record before: a message index follows a chunk or another one
         self.broken_chunk: int | None = None  # index of the loss of the chunk just before, to be counted by its indexes
         self.unchecked: Rows | None = None  # messages of the chunk just before, which has no CRC and differs from its index
@@ -85,7 +84,10 @@ class _Scanner:
             self.crc = zlib.crc32(MAGIC)
         while self.position < self.limit and not self.plan.reached_end:
             try:
-                self._record()
+                if self.previous == MESSAGE:
+                    self._take_leading_messages()
+                if self.position < self.limit:
+                    self._record()
             except DamagedRecord as error:
                 self._resume(str(error))
             if self.on_bytes is not None:
@@ -176,13 +178,8 @@ class _Scanner:
         if opcode == Opcode.MESSAGE:
             if len(body) < MESSAGE_HEAD.size:
                 raise DamagedRecord("a message is too short")
-            channel_id, _, log_time, _ = MESSAGE_HEAD.unpack_from(body)
-            if log_time > MAX_TIME_NS:
-                self.num_timeless += 1
-                return body
-            self.loose.add(offset - HEAD.size, offset + len(body), channel_id, log_time)
-            if self.loose.end - self.loose.begin > LOOSE_BLOCK_BYTES:
-                self._flush_loose()
+            head = HEAD.pack(opcode, len(body)) + body[: MESSAGE_HEAD.size]
+            self._add_loose(offset - HEAD.size, HEAD.size + len(body), rows_at(head, np.zeros(1, np.int64)))
             return body
         if opcode in (Opcode.CHANNEL, Opcode.SCHEMA):
             self._define(opcode, body)
@@ -199,13 +196,34 @@ class _Scanner:
             self.plan.library = library_of(body)
         return body
 
+    def _take_leading_messages(self) -> None:
+        """Plan, many at once, the messages outside chunks that follow each other from the position on, if there are any."""
+        data = self._read(self.position, min(self.window, self.limit - self.position))
+        rows, length = leading_rows(data)
+        if length:
+            self._add_loose(self.position, length, rows)
+            if self.crc is not None:
+                self.crc = zlib.crc32(memoryview(data)[:length], self.crc)
+            self.position += length
+        is_over = length < len(data) and data[length] != MESSAGE
+        self.window = _MIN_WINDOW_BYTES if is_over else min(2 * self.window, LOOSE_BLOCK_BYTES)
+
+    def _add_loose(self, offset: int, length: int, rows: Rows) -> None:
+        """Add the messages in these bytes of the file to the run of those outside chunks."""
+        usable = rows.usable()
+        self.num_timeless += len(rows) - len(usable)
+        if len(usable):
+            self.loose.add(offset, offset + length, usable)
+            if self.loose.end - self.loose.begin > LOOSE_BLOCK_BYTES:
+                self._flush_loose()
+
     def _compare_index(self, offset: int, channel_id: int, entries: npt.NDArray[np.void]) -> None:
         """Count what a broken chunk held, or say which index a chunk without checksum differs from."""
         if self.broken_chunk is not None:
             loss = self.plan.losses[self.broken_chunk]
             known = (loss.num_messages or 0) + len(entries)
             self.plan.losses[self.broken_chunk] = Loss(loss.offset, loss.reason, loss.span_ns, known)
-        elif self.unchecked is not None and not _agrees(self.unchecked, channel_id, entries):
+        elif self.unchecked is not None and not agrees(self.unchecked, channel_id, entries):
             where = f"At byte {offset}: the messages of a chunk without checksum differ from their index"
             self.plan.doubts.append(f"{where}; times of channel {channel_id} may be wrong.")
 
@@ -262,10 +280,7 @@ class _Scanner:
         self.num_timeless += len(found[0]) - len(rows)
         for opcode, body in definitions:  # only now: a chunk whose end is broken must not leave half of itself behind
             self._define(opcode, body)
-        first, last = (int(rows.log_time_ns.min()), int(rows.log_time_ns.max())) if len(rows) else (2**64, -1)
-        ids, counts = np.unique(rows.channel_id, return_counts=True)
-        num_messages = dict(zip(ids.tolist(), counts.tolist(), strict=True))
-        return Block(offset, length, "cut" if is_cut else "chunk", first, last, num_messages, index_length)
+        return Block(offset, length, "cut" if is_cut else "chunk", *rows.span_ns(), rows.counts(), index_length)
 
     def _index_behind(self, offset: int) -> tuple[Index, int]:
         """The message indexes that follow a chunk, up to the first that is damaged, and how many bytes they take."""
@@ -366,8 +381,8 @@ class _Scanner:
                 plan.doubts.append(f"{self.num_unknown} unknown records were skipped; no statistics tell whether any mattered.")
         if summary is None:
             return
-        plan.doubts += _prefer_index("Channel", plan.channels, summary.channels)
-        plan.doubts += _prefer_index("Schema", plan.schemas, summary.schemas)
+        plan.doubts += prefer_index("Channel", plan.channels, summary.channels)
+        plan.doubts += prefer_index("Schema", plan.schemas, summary.schemas)
         seen = {loss.offset for loss in plan.losses} | {
             block.offset - HEAD.size for block in plan.blocks if block.kind == "chunk"
         }
@@ -375,24 +390,6 @@ class _Scanner:
             if offset not in seen and index.message_index_offsets:
                 span = (index.message_start_time, index.message_end_time)
                 plan.losses.append(Loss(offset, "the chunk that the index names is not there", span))
-
-
-def _agrees(rows: Rows, channel_id: int, entries: npt.NDArray[np.void]) -> bool:
-    """Whether a message index names the messages of its channel, in any order."""
-    own = rows[rows.channel_id == channel_id]
-    found = np.empty(len(own), INDEX_ENTRY)
-    found["log_time"], found["offset"] = own.log_time_ns, own.begin - HEAD.size - MESSAGE_HEAD.size
-    return np.array_equal(np.sort(found), np.sort(entries))
-
-
-def _prefer_index(kind: str, known: dict[int, _Definition], indexed: Mapping[int, _Definition]) -> list[str]:
-    """Put the definitions of the index into `known`: it has a checksum, records outside chunks have none."""
-    doubts = []
-    for number, record in indexed.items():
-        if known.setdefault(number, record) != record:
-            doubts.append(f"{kind} {number} differs between the data and the index; the index was used.")
-            known[number] = record
-    return doubts
 
 
 def _is_span(start: int, end: int) -> bool:

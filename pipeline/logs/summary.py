@@ -4,7 +4,7 @@ import struct
 import zlib
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import BinaryIO, Final
+from typing import BinaryIO, Final, TypeVar
 
 from mcap import records
 from mcap.data_stream import ReadDataStream
@@ -13,6 +13,7 @@ from mcap.opcode import Opcode
 from pipeline.logs.records import HEAD, MAGIC, DamagedRecord, StrictStream, damage, parse_channel, parse_schema, walk
 
 _FOOTER: Final = struct.Struct("<BQQQI")
+_Definition = TypeVar("_Definition", records.Channel, records.Schema)
 MAX_SUMMARY_BYTES: Final = 2**30
 
 _PARSERS: Final[Mapping[Opcode, Callable[[ReadDataStream], records.McapRecord]]] = {
@@ -62,6 +63,16 @@ def parse_summary_record(opcode: int, body: bytes) -> records.McapRecord:
     if stream.count != len(body):
         raise DamagedRecord("the lengths in a record of the summary contradict each other")
     return record
+
+
+def prefer_index(kind: str, known: dict[int, _Definition], indexed: Mapping[int, _Definition]) -> list[str]:
+    """Put the definitions of the index into `known`: it has a checksum, records outside chunks have none. What differs."""
+    doubts = []
+    for number, record in indexed.items():
+        if known.setdefault(number, record) != record:
+            doubts.append(f"{kind} {number} differs between the data and the index; the index was used.")
+            known[number] = record
+    return doubts
 
 
 def _read(file: BinaryIO, size: int) -> Summary:

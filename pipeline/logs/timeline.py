@@ -7,9 +7,8 @@ arrays of places. Where many blocks overlap, their bytes are not all held but re
 import contextlib
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from itertools import chain
+from itertools import chain, groupby
 from pathlib import Path
 from typing import BinaryIO, Final, Literal
 
@@ -109,17 +108,12 @@ class Timeline:
     def _blocks(self) -> Iterator[tuple[int, Block, tuple[bytes, Rows] | None]]:
         """Number of the source, block, and what `_load` gives where anything in it is wanted.
 
-        The next block is read meanwhile in a thread: reading, unpacking and checksums let Python go on.
+        No thread reads ahead: for every chunk it would wait several times for the interpreter, which costs what it saves.
         """
-        coming: tuple[int, Block, Future[tuple[bytes, Rows]] | None] | None = None
-        with ThreadPoolExecutor(max_workers=1) as ahead:
-            for _, number, _, block in self.places:
-                future = ahead.submit(self._load, number, block) if self._is_wanted(number, block) else None
-                if coming is not None:
-                    yield coming[0], coming[1], _result(coming[2])
-                coming = number, block, future
-            if coming is not None:
-                yield coming[0], coming[1], _result(coming[2])
+        for number, places in groupby(self.places, key=lambda place: place[1]):
+            with reading(self.sources[number].path) as file:
+                for _, _, _, block in places:
+                    yield number, block, self._load(file, number, block) if self._is_wanted(number, block) else None
 
     def _is_wanted(self, number: int, block: Block) -> bool:
         is_in_time = block.start_ns < self.selection.end_ns and block.end_ns >= self.selection.start_ns
@@ -134,13 +128,12 @@ class Timeline:
             total = sum(part.size_bytes - sum(block.length for block in part.blocks) for part in self.sources)
             self.on_bytes(total)
 
-    def _load(self, number: int, block: Block) -> tuple[bytes, Rows]:
-        """The bytes of a block, and its selected messages by time."""
-        part, wanted = self.sources[number], self.selection.channels[number]
-        with reading(part.path) as file:
-            data = _unpacked(file, block)
-            index = b"" if block.index_length == 0 else read_span(file, block.offset + block.length, block.index_length)
-            rows = indexed_rows(data, index, wanted.keys()) if index else _walked(data, block, wanted)
+    def _load(self, file: BinaryIO, number: int, block: Block) -> tuple[bytes, Rows]:
+        """The bytes of a block of a source, and its selected messages by time."""
+        wanted = self.selection.channels[number]
+        data = _unpacked(file, block)
+        index = b"" if block.index_length == 0 else read_span(file, block.offset + block.length, block.index_length)
+        rows = indexed_rows(data, index, wanted.keys()) if index else _walked(data, block, wanted)
         is_in_time = (rows.log_time_ns >= self.selection.start_ns) & (rows.log_time_ns < np.uint64(self.selection.end_ns))
         return data, (rows if is_in_time.all() else rows[is_in_time]).by_time()
 
@@ -190,10 +183,6 @@ class Timeline:
             messages = raw_messages(channels, self._bytes(pieces[number]), rows[stretch[places]])
             found += zip(places.tolist(), messages, strict=True)
         return [message for _, message in sorted(found, key=lambda item: item[0])]
-
-
-def _result(future: Future[tuple[bytes, Rows]] | None) -> tuple[bytes, Rows] | None:
-    return None if future is None else future.result()
 
 
 def read_span(file: BinaryIO, offset: int, length: int) -> bytes:
