@@ -7,8 +7,7 @@ from cadence.association.fitting import fit_habits
 from cadence.association.naming import named_like
 from cadence.association.particles import Particles, Stream, follow
 from cadence.association.presence import Habits
-from cadence.association.resampling import resample
-from cadence.association.types import CLUTTER, AssociationConfig, Associations
+from cadence.association.types import CLUTTER, AssociationConfig, Associations, agent_probability
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -62,17 +61,29 @@ def _readings(
     reference = np.zeros(0, dtype=np.int64)
     for number, particles in enumerate(follow(stream, habits, config.num_particles, seed)):
         if number in wanted:
-            label, weight = _likeliest(particles, config.num_ways, np.random.default_rng([seed, number]).random())
-            label[0] = named_like(label[0], reference)
-            for way in range(1, len(label)):
-                label[way] = named_like(label[way], label[0])
+            label, weight = _drawn(particles, config.num_ways, np.random.default_rng([seed, number]))
+            label, weight = _named(label, weight, reference)
             out[number] = label, weight
             reference = label[0]
     return out
 
 
-def _likeliest(particles: Particles, num_ways: int, uniform: float) -> tuple[Integers, Floats]:
-    """Ways that stand for all particles, without bias, the likeliest first."""
-    index, weight = resample(particles.weight, num_ways, uniform)
-    order = np.argsort(-weight, kind="stable")
-    return particles.label[index[order]], weight[order]
+def _drawn(particles: Particles, num_ways: int, generator: np.random.Generator) -> tuple[Integers, Floats]:
+    """At most so many different ways that stand for all, without bias."""
+    points = (np.arange(num_ways) + generator.random()) / num_ways
+    last_used = int(np.flatnonzero(particles.weight > 0)[-1])
+    particle = np.minimum(np.searchsorted(np.cumsum(particles.weight), points), last_used)
+    label, count = np.unique(particles.ways(particle, generator), axis=0, return_counts=True)
+    return label, count / num_ways
+
+
+def _named(label: Integers, weight: Floats, reference: Integers) -> tuple[Integers, Floats]:
+    """The same ways with common names for their agents; first the one that agrees most with all, then the likeliest."""
+    label = np.stack([named_like(way, reference) for way in label])
+    label = np.stack([named_like(way, label[weight.argmax()]) for way in label])
+    probability = agent_probability(Associations(label, weight, int(label.max(initial=CLUTTER)) + 1))
+    agreement = probability[np.arange(label.shape[1]), label].sum(axis=1)  # the last column is clutter's, label -1
+    best = int(agreement.argmax())
+    order = np.argsort(-weight - (np.arange(len(weight)) == best), kind="stable")
+    label = label[order]
+    return np.stack([label[0], *(named_like(way, label[0]) for way in label[1:])]), weight[order]

@@ -5,6 +5,7 @@ those that are not met are left out. Where the number of agents is unknown the l
 """
 
 import dataclasses
+import itertools
 import math
 
 import numpy as np
@@ -12,8 +13,9 @@ from numpy.typing import NDArray
 
 from cadence.association.motion import Modes
 from cadence.association.particles import Particles, Stream, follow
-from cadence.association.presence import Habits
-from cadence.association.types import CLUTTER, AssociationConfig
+from cadence.association.presence import Habits, left_by
+from cadence.association.tracks import Tracks
+from cadence.association.types import AssociationConfig
 
 Floats = NDArray[np.float64]
 
@@ -28,6 +30,10 @@ _FLOOR = 1e-5
 _LEAST_CLUTTER = 1e-6
 """A detection that fits nobody must not rule out all ways, whatever the settings say."""
 _NUM_AGENTS = (3, 10, 30)
+_FIRST_DEPARTURES = 0.5
+"""How many agents are thought to leave within a log before anything is known."""
+_RATE_WEIGHTS = (2.0, 5.0, 15.0, 50.0)
+_RATE_MEMORIES = (0.75, 0.9, 1.0)
 _NUM_PARTICLES, _MAX_DETECTIONS, _NUM_ROUNDS = 16, 400, 3
 _LEAST_SHARE, _PSEUDO_COUNT = 0.02, 4.0
 
@@ -62,8 +68,10 @@ def _first_habits(stream: Stream, config: AssociationConfig, num_agents: int, ma
     return Habits(
         modes=Modes(relaxation_s, speeds_mps, share, _SWITCH_SHARE),
         rate_hz=1.0 / gap_s,
-        leave_hz=0.0 if is_known else 1.0 / span_s,
-        arrive_hz=0.0 if is_known else num_agents / span_s,
+        rate_weight=_RATE_WEIGHTS[1],
+        rate_memory=_RATE_MEMORIES[1],
+        leave_hz=0.0 if is_known else _FIRST_DEPARTURES / span_s,
+        num_present=float(num_agents),
         clutter_hz=max(config.clutter_share, _LEAST_CLUTTER) * num / span_s,
         area_m2=float(np.prod(np.maximum(sizes, 0.1 * extent_m))),
         temper=_TEMPER,
@@ -78,19 +86,17 @@ def _run(stream: Stream, habits: Habits, seed: int) -> tuple[Particles, Floats]:
     """The particles after the whole stream, and how much each mode was used [C]."""
     usage = np.zeros(len(habits.modes))
     switch, share = habits.modes.switch_share, habits.modes.share
-    for particles in follow(stream, habits, _NUM_PARTICLES, seed):
-        if particles.label.shape[1]:
-            agent = particles.label[:, -1]
-            rows = np.flatnonzero(agent != CLUTTER)
-            rows = rows[particles.tracks.count[rows, agent[rows]] > 1]
-            after = np.exp(particles.tracks.log_share[rows, agent[rows]])
-            before_switch = (after - switch * share) / (1.0 - switch)
-            usage += (particles.weight[rows, None] * before_switch).sum(0)
+    for number, particles in enumerate(follow(stream, habits, _NUM_PARTICLES, seed), -1):
+        is_seen_again = (particles.recent[..., -1] == number) & (particles.recent[..., -2] >= 0)
+        row, agent = np.nonzero(is_seen_again)
+        after = np.exp(particles.tracks.log_share[row, agent])
+        before_switch = (after - switch * share) / (1.0 - switch)
+        usage += (particles.weight[row, None] * before_switch).sum(0)
     return particles, usage
 
 
 def _improved(habits: Habits, particles: Particles, usage: Floats, stream: Stream) -> Habits:
-    """Habits after one round: modes as often as they were used, rates as the likeliest way counts them."""
+    """Habits after one round: modes as often as they were used, rates as a way of the likeliest particle counts them."""
     share = usage + _PSEUDO_COUNT / len(usage)
     share = share / share.sum()
     is_used = share >= _LEAST_SHARE
@@ -98,12 +104,35 @@ def _improved(habits: Habits, particles: Particles, usage: Floats, stream: Strea
     modes = Modes(
         modes.relaxation_s[is_used], modes.speed_mps[is_used], share[is_used] / share[is_used].sum(), modes.switch_share
     )
-    best = int(particles.weight.argmax())
-    tracks = particles.tracks
-    num = int(tracks.num_agents[best])
-    watched_s = float((tracks.last_s - tracks.first_s)[best, :num].sum())
-    again = float(tracks.count[best, :num].sum() - num)
-    if habits.num_agents is not None or again < 1 or watched_s <= 0:
+    best = np.array([particles.weight.argmax()])
+    label = particles.ways(best, np.random.default_rng(0))[0]
+    gaps_s = [np.diff(stream.time_s[label == agent]) for agent in range(int(label.max()) + 1)]
+    watched_s, again = sum(float(gap.sum()) for gap in gaps_s), sum(map(len, gaps_s))
+    if again < 1 or watched_s <= 0:
         return dataclasses.replace(habits, modes=modes)
-    span_s = float(np.ptp(stream.time_s))
-    return dataclasses.replace(habits, modes=modes, rate_hz=again / watched_s, arrive_hz=num / span_s)
+    if habits.num_agents is None:
+        habits = _with_rates(habits, particles.tracks[best], again / watched_s, watched_s, float(np.ptp(stream.time_s)))
+    rate_hz, laws = habits.rate_hz, itertools.product(_RATE_WEIGHTS, _RATE_MEMORIES)
+    weight, memory = max(laws, key=lambda law: _log_density(gaps_s, rate_hz, *law))
+    return dataclasses.replace(habits, modes=modes, rate_weight=weight, rate_memory=memory)
+
+
+def _with_rates(habits: Habits, tracks: Tracks, rate_hz: float, watched_s: float, span_s: float) -> Habits:
+    """How often agents are detected, come and leave, as one way counts it."""
+    num = int(tracks.num_agents[0])
+    left = left_by(tracks, habits, span_s)[0, :num]
+    watched_s += float(((1.0 - left) * (span_s - tracks.last_s[0, :num])).sum())
+    leave_hz = (float(left.sum()) + _FIRST_DEPARTURES) / watched_s
+    return dataclasses.replace(habits, rate_hz=rate_hz, leave_hz=leave_hz, num_present=num / (1.0 + leave_hz * span_s))
+
+
+def _log_density(gaps_s: list[Floats], rate_hz: float, weight: float, memory: float) -> float:
+    """Log density of agents' gaps between detections, where each has a rate of its own (see `presence`)."""
+    total = 0.0
+    for gaps in gaps_s:
+        repeats, watched_s = 0.0, 0.0
+        for gap_s in gaps.tolist():
+            count, time_s = weight + repeats, weight / rate_hz + watched_s
+            total += math.log(count / time_s) - (count + 1.0) * math.log1p(gap_s / time_s)
+            repeats, watched_s = 1.0 + memory * repeats, gap_s + memory * watched_s
+    return total

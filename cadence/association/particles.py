@@ -2,7 +2,8 @@
 
 Rao-Blackwellised particle data association (Särkkä, Vehtari, Lampinen, "Rao-Blackwellized particle filter for multiple target
 tracking", 2007). Every way is continued by every agent that may have caused the next detection, and of all continuations the
-best are kept and the others drawn from (`resampling`), which is the optimal importance distribution without its noise.
+best are kept and the others drawn from (`resampling`), which is the optimal importance distribution without its noise. Ways
+that have become alike are one from then on (`history`).
 """
 
 from collections.abc import Iterator
@@ -11,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from cadence.association.history import Step, drawn_ways, grouped, recently, step_of
 from cadence.association.presence import Habits, log_hazards, log_silence_between
 from cadence.association.resampling import resample
 from cadence.association.tracks import Detection, Tracks, log_densities, updated
@@ -18,6 +20,9 @@ from cadence.association.types import CLUTTER
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
+
+NUM_RECENT = 3
+"""An agent's last detections from which its future follows: older ones say little that these do not."""
 
 _NEGLIGIBLE = 1e-6
 """Ways of less weight are given up even where there is room: a clear stretch of a stream needs few."""
@@ -51,28 +56,39 @@ class Stream:
 
 @dataclass(frozen=True, eq=False)
 class Particles:
-    """P ways to read the first N detections.
+    """P ways to read the first N detections, each with all pasts that led to it.
 
-    label         [P, N] agents in the order in which the way met them, -1 clutter
     weight        [P] sums to one
-    tracks        what each way knows of its agents
+    tracks        what each way knows of its agents, which it numbers by itself
+    recent        [P, A, L] the last detections of each agent, oldest first, -1 for none
+    steps         [N] how the particles came about
     log_evidence  log density of the detections so far
     """
 
-    label: Integers
     weight: Floats
     tracks: Tracks
+    recent: Integers
+    steps: list[Step]
     log_evidence: float
 
+    def ways(self, particle: Integers, generator: np.random.Generator) -> Integers:
+        """Labels [M, N] of one way for each of M particles, drawn from its pasts."""
+        return drawn_ways(self.steps, particle, generator)
 
-def follow(stream: Stream, habits: Habits, num_particles: int, seed: int) -> Iterator[Particles]:
-    """The particles before the first detection and after each one: N + 1 times."""
+
+def follow(stream: Stream, habits: Habits, num_particles: int, seed: int, num_recent: int = NUM_RECENT) -> Iterator[Particles]:
+    """The particles before the first detection and after each one: N + 1 times, each valid until the next is asked for.
+
+    Ways that agree on the last `num_recent` detections of every agent are one particle.
+    """
     generator = np.random.default_rng(seed)
-    particles = Particles(np.zeros((1, 0), dtype=np.int64), np.ones(1), Tracks.none(len(habits.modes)), 0.0)
+    recent = np.zeros((1, 0, num_recent), dtype=np.int64)
+    particles = Particles(np.ones(1), Tracks.none(len(habits.modes)), recent, [], 0.0)
     yield particles
     floor = habits.floor_m**2 * np.eye(2)
-    before_s = float(stream.time_s[0]) if len(stream.time_s) else 0.0
-    for time_s, position_m, covariance_m2 in zip(stream.time_s, stream.position_m, stream.covariance_m2, strict=True):
+    before_s = 0.0
+    since_s = stream.time_s - stream.time_s[:1]
+    for time_s, position_m, covariance_m2 in zip(since_s, stream.position_m, stream.covariance_m2, strict=True):
         seen = Detection(float(time_s), position_m, covariance_m2 + floor)
         particles = _next(particles, habits, seen, before_s, num_particles, float(generator.random()))
         before_s = seen.time_s
@@ -89,14 +105,28 @@ def _next(
     weight = np.exp(likelihood - peak)
     total = float(weight.sum())
     share = weight.ravel() / total
-    share[share < _NEGLIGIBLE] = 0.0
-    flat, new_weight = resample(share, num_particles, uniform)
+    flat = np.flatnonzero(share >= _NEGLIGIBLE)
     parent, column = np.divmod(flat, weight.shape[1])
     num_slots = weight.shape[1] - 2
     agent = np.where(column == num_slots, tracks.num_agents[parent], np.where(column > num_slots, CLUTTER, column))
-    label = np.concatenate([particles.label[parent], agent[:, None]], axis=1)
+    recent = _with_room(particles.recent, int(agent.max(initial=CLUTTER)) + 1)[parent]
+    recent = recently(recent, agent, len(particles.steps))
+    group, order = grouped(recent)
+    group_share = np.bincount(group, share[flat])
+    kept, new_weight = resample(group_share / group_share.sum(), num_particles, uniform)
+    child = np.full(len(group_share), -1)
+    child[kept] = np.arange(len(kept))
+    step, way = step_of(share[flat], parent, agent, group, order, child)
+    particles.steps.append(step)
     log_evidence = particles.log_evidence + peak + float(np.log(total))
-    return Particles(label, new_weight, updated(tracks[parent], habits.modes, seen, agent), log_evidence)
+    after = updated(tracks[parent[way]], habits.modes, seen, agent[way], habits.rate_memory)
+    return Particles(new_weight, after, recent[way], particles.steps, log_evidence)
+
+
+def _with_room(recent: Integers, num_slots: int) -> Integers:
+    """The same with room for so many agents at least."""
+    more = max(num_slots - recent.shape[1], 0)
+    return np.pad(recent, [(0, 0), (0, more), (0, 0)], constant_values=-1)
 
 
 def continuations(tracks: Tracks, habits: Habits, seen: Detection, before_s: float) -> Floats:

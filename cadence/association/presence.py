@@ -1,7 +1,10 @@
 """How often agents are detected, come and go: what is expected of the next detection before its position is looked at.
 
-An agent is detected at a rate of its own (a gamma law around the stream's rate, learned from its detections) until it leaves,
-after an exponential time. Neither is sampled: that a silent agent may have left is part of how unlikely its next detection is.
+An agent is detected at a rate of its own until it leaves, after an exponential time. The rate has a gamma law around the
+stream's rate, learned from the agent's detections, of which the latest count most where rates change: a ship at anchor reports
+less often than one under way. Neither is sampled: that a silent agent may have left is part of how unlikely its next detection
+is. Where the number of agents is unknown, as many come as leave, and those who are there at first are met soon. Times are
+seconds since the first detection.
 """
 
 from dataclasses import dataclass
@@ -14,9 +17,6 @@ from cadence.association.tracks import Tracks
 
 Floats = NDArray[np.float64]
 
-_PRIOR_COUNT = 10.0
-"""How many detections' worth of evidence the stream's rate holds against an agent's own."""
-
 
 @dataclass(frozen=True, eq=False)
 class Habits:
@@ -24,8 +24,10 @@ class Habits:
 
     modes          how agents move
     rate_hz        detections of an agent per second
+    rate_weight    how many detections' worth of evidence that rate holds against an agent's own
+    rate_memory    with each detection of an agent the earlier ones count this much for its own rate, in (0, 1]
     leave_hz       one over the mean time an agent stays; zero: all stay all through the log
-    arrive_hz      new agents detected per second, where the number of agents is unknown
+    num_present    how many are there at a moment on average, from the first detection on, where their number is unknown
     clutter_hz     false detections per second
     area_m2        where new agents and clutter are met, evenly
     temper         exponent of a position's density: below one, as every model of motion is wrong a little
@@ -37,8 +39,10 @@ class Habits:
 
     modes: Modes
     rate_hz: float
+    rate_weight: float
+    rate_memory: float
     leave_hz: float
-    arrive_hz: float
+    num_present: float
     clutter_hz: float
     area_m2: float
     temper: float
@@ -54,22 +58,32 @@ def log_silence(tracks: Tracks, habits: Habits, time_s: float) -> tuple[Floats, 
     An agent that stays is silent with probability (1 + silent / watched) ^ -count (a Poisson process whose rate has a gamma
     law); one that leaves is silent from then on. The two are joined as for a Poisson process of the same silence.
     """
-    silent_s = np.maximum(time_s - tracks.last_s, 0.0)
-    watched_s = _PRIOR_COUNT / habits.rate_hz + tracks.last_s - tracks.first_s
-    count = _PRIOR_COUNT + np.maximum(tracks.count - 1, 0)
-    unseen = count * np.log1p(silent_s / watched_s)
-    left = habits.leave_hz * silent_s
+    count, watched_s, unseen, left = _waiting(tracks, habits, time_s)
     total = unseen + left
     with np.errstate(divide="ignore", invalid="ignore"):
         silence = np.logaddexp(np.log(left), np.log(unseen) - total) - np.log(total)
-    return np.where(total > 0, silence, 0.0), np.log(count / (watched_s + silent_s)) - total
+    return np.where(total > 0, silence, 0.0), np.log(count / watched_s) - total
+
+
+def left_by(tracks: Tracks, habits: Habits, time_s: float) -> Floats:
+    """Probability that an agent has left, given its silence from its last detection to `time_s` [P, A]."""
+    _, _, unseen, left = _waiting(tracks, habits, time_s)
+    return np.asarray(1.0 - np.exp(-unseen - left - log_silence(tracks, habits, time_s)[0]))
+
+
+def _waiting(tracks: Tracks, habits: Habits, time_s: float) -> tuple[Floats, Floats, Floats, Floats]:
+    """Evidence of each agent's rate at `time_s` (detections, seconds), and minus the log probabilities of silence and stay."""
+    silent_s = np.maximum(time_s - tracks.last_s, 0.0)
+    watched_s = habits.rate_weight / habits.rate_hz + tracks.watched_s
+    count = habits.rate_weight + tracks.repeats
+    return count, watched_s + silent_s, count * np.log1p(silent_s / watched_s), habits.leave_hz * silent_s
 
 
 def log_silence_between(tracks: Tracks, habits: Habits, begin_s: float, end_s: float) -> Floats:
     """Log probability that nobody was detected from `begin_s` to `end_s`, given the detections up to `begin_s` [P]."""
     is_met = np.arange(tracks.last_s.shape[1]) < tracks.num_agents[:, None]
     silence = log_silence(tracks, habits, end_s)[0] - log_silence(tracks, habits, begin_s)[0]
-    return np.asarray(np.where(is_met, silence, 0.0).sum(1) - _new_hz(tracks, habits) * (end_s - begin_s))
+    return np.asarray(np.where(is_met, silence, 0.0).sum(1) - _num_new(tracks, habits, begin_s, end_s))
 
 
 def log_hazards(tracks: Tracks, habits: Habits, time_s: float) -> Floats:
@@ -83,13 +97,24 @@ def log_hazards(tracks: Tracks, habits: Habits, time_s: float) -> Floats:
     hazards = np.empty((num_particles, num_slots + 2))
     hazards[:, :-2] = np.where(is_possible, again - silence, -np.inf)
     with np.errstate(divide="ignore"):
-        hazards[:, -2] = np.log(_new_hz(tracks, habits))
+        hazards[:, -2] = np.log(_new_hz(tracks, habits, time_s))
         hazards[:, -1] = np.log(habits.clutter_hz)
     return hazards
 
 
-def _new_hz(tracks: Tracks, habits: Habits) -> Floats:
-    """Rate at which an agent is met for the first time [P]."""
-    if habits.num_agents is None:
-        return np.asarray(np.where(tracks.num_agents < habits.max_agents, habits.arrive_hz, 0.0), dtype=np.float64)
-    return np.asarray((habits.num_agents - tracks.num_agents) * habits.rate_hz)
+def _new_hz(tracks: Tracks, habits: Habits, time_s: float) -> Floats:
+    """Rate at which an agent is met for the first time [P]; where their number is unknown: there at first, or come later."""
+    if habits.num_agents is not None:
+        return np.asarray((habits.num_agents - tracks.num_agents) * habits.rate_hz)
+    waited = 1.0 + habits.rate_hz * time_s / habits.rate_weight
+    new_hz = habits.num_present * (habits.leave_hz + habits.rate_hz * waited ** -(habits.rate_weight + 1.0))
+    return np.where(tracks.num_agents < habits.max_agents, new_hz, 0.0)
+
+
+def _num_new(tracks: Tracks, habits: Habits, begin_s: float, end_s: float) -> Floats:
+    """The integral of `_new_hz` [P]."""
+    if habits.num_agents is not None:
+        return _new_hz(tracks, habits, begin_s) * (end_s - begin_s)
+    unmet = [(1.0 + habits.rate_hz * time_s / habits.rate_weight) ** -habits.rate_weight for time_s in (begin_s, end_s)]
+    num_new = habits.num_present * (habits.leave_hz * (end_s - begin_s) + unmet[0] - unmet[1])
+    return np.where(tracks.num_agents < habits.max_agents, num_new, 0.0)

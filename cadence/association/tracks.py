@@ -21,8 +21,8 @@ class Tracks:
     covariance  [P, A, C, 4, 4]
     log_share   [P, A, C] log probability of the modes
     last_s      [P, A] time of the last detection
-    first_s     [P, A] time of the first
-    count       [P, A] number of detections
+    repeats     [P, A] detections after the first, of which old ones count less
+    watched_s   [P, A] time in which they came, counted alike
     num_agents  [P] agents met so far
     """
 
@@ -30,8 +30,8 @@ class Tracks:
     covariance: Floats
     log_share: Floats
     last_s: Floats
-    first_s: Floats
-    count: Integers
+    repeats: Floats
+    watched_s: Floats
     num_agents: Integers
 
     @classmethod
@@ -43,7 +43,7 @@ class Tracks:
             np.zeros((1, 0, num_modes)),
             np.zeros((1, 0)),
             np.zeros((1, 0)),
-            np.zeros((1, 0), dtype=np.int64),
+            np.zeros((1, 0)),
             np.zeros(1, dtype=np.int64),
         )
 
@@ -95,8 +95,11 @@ def log_densities(tracks: Tracks, modes: Modes, seen: Detection) -> Floats:
     return np.asarray((peak + np.log(np.exp(density - peak).sum(-1, keepdims=True)))[..., 0])
 
 
-def updated(tracks: Tracks, modes: Modes, seen: Detection, agent: Integers) -> Tracks:
-    """The particles after the detection was given to `agent` [P]: one that was met, the next new one, or -1, nobody."""
+def updated(tracks: Tracks, modes: Modes, seen: Detection, agent: Integers, memory: float = 1.0) -> Tracks:
+    """The particles after the detection was given to `agent` [P]: one that was met, the next new one, or -1, nobody.
+
+    With each detection of an agent the earlier ones count `memory` times as much for how often it is detected.
+    """
     tracks = tracks.with_room(int(agent.max(initial=-1)) + 1)
     out = tracks[np.arange(len(agent))]  # a copy
     is_new = agent == tracks.num_agents
@@ -107,8 +110,9 @@ def updated(tracks: Tracks, modes: Modes, seen: Detection, agent: Integers) -> T
     ):
         out.mean[rows, agent[rows]], out.covariance[rows, agent[rows]], out.log_share[rows, agent[rows]] = state
         out.last_s[rows, agent[rows]] = seen.time_s
-        out.count[rows, agent[rows]] += 1
-    out.first_s[first, agent[first]] = seen.time_s
+    column = agent[again]
+    out.repeats[again, column] = 1.0 + memory * tracks.repeats[again, column]
+    out.watched_s[again, column] = seen.time_s - tracks.last_s[again, column] + memory * tracks.watched_s[again, column]
     out.num_agents[first] += 1
     return out
 

@@ -16,14 +16,14 @@ class AssociationConfig:
     num_agents     how many agents there are, all through the log; None: unknown, agents come and go
     max_agents     where the number is unknown: never more than this
     num_particles  ways to read the log that are followed side by side
-    num_ways       likeliest ways that are kept at a window origin, drawn without bias from the particles
+    num_ways       ways that are drawn at a window origin, without bias, from all that the particles stand for
     clutter_share  share of the detections that no agent caused
     """
 
     num_agents: int | None = None
     max_agents: int = 64
     num_particles: int = 200
-    num_ways: int = 30
+    num_ways: int = 60
     clutter_share: float = 0.01
 
     def __post_init__(self) -> None:
@@ -40,7 +40,7 @@ class Associations:
     """What a stream's detections up to one moment may have come from: M weighted ways.
 
     label       [M, N] int64: agent 0 .. num_agents - 1 of each of the N detections known at that moment, -1 clutter
-    weight      [M] non-negative, sums to one; the likeliest way first
+    weight      [M] non-negative, sums to one; first the way that agrees most with all
     num_agents  agents that are numbered in the log as a whole; some may have no detection yet
     """
 

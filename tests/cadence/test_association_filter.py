@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 import torch
 
+from cadence.association.history import Step, drawn_ways, grouped, recently, step_of
 from cadence.association.motion import Modes, motion
 from cadence.association.particles import Stream, continuations, follow
-from cadence.association.presence import Habits, log_silence
+from cadence.association.presence import Habits, left_by, log_hazards, log_silence, log_silence_between
 from cadence.association.resampling import resample, threshold
 from cadence.association.tracks import Detection, Tracks, log_densities, updated
 from cadence.association.types import CLUTTER
@@ -20,13 +21,13 @@ TWO = Modes(np.array([20.0, 300.0]), np.array([0.5, 3.0]), np.array([0.4, 0.6]),
 
 
 def habits(num_agents=2, leave_hz=0.0, modes=TWO, temper=1.0):
-    return Habits(modes, 0.02, leave_hz, 0.01, 0.001, 1e6, temper, 0.0, num_agents, 9, None)
+    return Habits(modes, 0.02, 10.0, 1.0, leave_hz, 0.01, 0.001, 1e6, temper, 0.0, num_agents, 9, None)
 
 
 def stream(num, seed=0):
     rng = np.random.default_rng(seed)
     covariance = np.broadcast_to(25.0 * np.eye(2), (num, 2, 2)).copy()
-    return Stream(np.cumsum(rng.uniform(5.0, 40.0, num)), rng.normal(0.0, 60.0, (num, 2)), covariance)
+    return Stream(np.append(0.0, np.cumsum(rng.uniform(5.0, 40.0, num - 1))), rng.normal(0.0, 60.0, (num, 2)), covariance)
 
 
 def forced(label, seen, about):
@@ -51,29 +52,72 @@ def labellings(num, most):
             yield label
 
 
+def labels(particles):
+    """One way of each particle: the only one where it remembers all detections."""
+    return particles.ways(np.arange(len(particles.weight)), np.random.default_rng(0))
+
+
 @pytest.mark.parametrize(("num_agents", "leave_hz"), [(2, 0.0), (None, 0.002)])
 def test_enough_particles_are_the_exact_law_of_all_labellings(num_agents, leave_hz):
     seen, about = stream(5), habits(num_agents, leave_hz)
     ways = list(labellings(5, num_agents or 5))
     exact = np.array([forced(way, seen, about) for way in ways])
-    *_, last = follow(seen, about, 10_000, seed=0)
+    *_, last = follow(seen, about, 10_000, seed=0, num_recent=5)
     law = dict(zip(ways, np.exp(exact - np.logaddexp.reduce(exact)), strict=True))
     np.testing.assert_allclose(last.log_evidence, np.logaddexp.reduce(exact), atol=1e-4)
-    for label, weight in zip(last.label, last.weight, strict=True):
+    for label, weight in zip(labels(last), last.weight, strict=True):
         np.testing.assert_allclose(weight, law[tuple(label.tolist())], atol=1e-4)
 
 
 def test_few_particles_are_right_on_average():
     seen, about = stream(6), habits()
-    *_, exact = follow(seen, about, 10_000, seed=0)
-    wanted = exact.weight @ (exact.label == 0)
+    *_, exact = follow(seen, about, 10_000, seed=0, num_recent=6)
+    wanted = exact.weight @ (labels(exact) == 0)
     found = []
     for seed in range(120):
-        *_, last = follow(seen, about, 6, seed)
+        *_, last = follow(seen, about, 6, seed, num_recent=6)
         assert len(last.weight) <= 6
-        found.append(np.exp(last.log_evidence - exact.log_evidence) * (last.weight @ (last.label == 0)))
+        found.append(np.exp(last.log_evidence - exact.log_evidence) * (last.weight @ (labels(last) == 0)))
     error = np.std(found, axis=0) / np.sqrt(len(found))
     assert (np.abs(np.mean(found, axis=0) - wanted) < 4.5 * error + 1e-3).all()
+
+
+def test_ways_of_like_future_are_one_and_keep_their_pasts():
+    """Two agents wait at one place and part: fewer than half of the particles say as much of who is who."""
+    time = 30.0 * np.arange(38)
+    way = np.where(time < 480.0, time - 480.0, np.where(time < 660.0, 0.0, time - 660.0)) * 4.0
+    place = np.stack([way, np.where(np.arange(38) % 2 == 0, 1.0, -1.0) * np.abs(way) * 0.5], axis=1)
+    seen = Stream(time, place + np.random.default_rng(2).normal(0.0, 1.0, place.shape), np.ones((38, 1, 1)) * np.eye(2))
+    modes = Modes(np.array([20.0, 700.0, 4000.0]), np.array([1.0, 3.0, 3.0]), np.ones(3) / 3, 0.2)
+    about, share, num = dataclasses.replace(habits(modes=modes), area_m2=3e6), [], []
+    for num_recent in (38, 6):
+        *_, last = follow(seen, about, 3000, seed=0, num_recent=num_recent)
+        particle = np.random.default_rng(1).choice(len(last.weight), 4000, p=last.weight)
+        label = last.ways(particle, np.random.default_rng(2))
+        share.append((label[:, -8] == label[:, 0]).mean())
+        num.append(len(last.weight))
+    assert 0.05 < share[0] < 0.95
+    assert abs(share[0] - share[1]) < 0.04
+    assert num[1] < 0.5 * num[0]
+
+
+def test_pasts_are_drawn_by_their_shares_under_the_childs_names():
+    """Two detections; the two ways after the second differ in who is who and become one particle of weights 3 to 1."""
+    parts = [np.array([0, 1]), np.array([3.0, 1.0]), np.array([0, 1])]
+    recent = recently(np.array([[[0], [1]], [[1], [0]]]), np.array([0, 1]), 2)  # both: detection 2 where 0 was, 1 elsewhere
+    group, order = grouped(recent)
+    assert group.tolist() == [0, 0]
+    step, way = step_of(parts[1], parts[0], parts[2], group, order, np.array([0]))
+    assert way.tolist() == [0]
+    first = [
+        step_of(np.ones(1), np.array([0]), np.array([0]), np.array([0]), np.array([[0, 1]]), np.array([0]))[0],
+        Step(np.array([0, 1]), np.array([0, 0]), np.ones(2), np.array([1, 1]), np.array([0, 1]), np.array([[0, 1], [1, 0]])),
+    ]
+    label = drawn_ways([*first, step], np.zeros(4000, dtype=np.int64), np.random.default_rng(0))
+    np.testing.assert_array_equal(label[:, 2], 0)
+    ways, count = np.unique(label, axis=0, return_counts=True)
+    assert len(ways) == 2
+    np.testing.assert_allclose(np.sort(count) / 4000, [0.25, 0.75], atol=0.03)
 
 
 def test_nobody_exceeds_the_speed_limit():
@@ -152,6 +196,39 @@ def test_silence_and_the_next_detection_are_one_law():
     leaves = np.exp(log_silence(tracks, habits(leave_hz=0.01), 1e7)[0][0, 0])
     assert 0.0 < leaves < 1.0
     assert np.exp(log_silence(tracks, stays, 1e7)[0][0, 0]) < 1e-5
+
+
+def test_new_agents_are_met_as_often_as_their_rate_says():
+    """Nobody is met yet: the log probability of silence is minus the integral of the rate of new agents."""
+    about, nobody = habits(num_agents=None, leave_hz=2e-4), Tracks.none(2)
+    moments = np.linspace(0.0, 2000.0, 4001)
+    rate = np.exp([log_hazards(nobody, about, moment)[0, -2] for moment in moments])
+    silence = log_silence_between(nobody, about, 0.0, 2000.0)[0]
+    np.testing.assert_allclose(-silence, np.trapezoid(rate, moments), rtol=1e-4)
+    # those there at first are met, then only who comes: as many as leave
+    np.testing.assert_allclose(rate[[0, -1]], about.num_present * np.array([0.0202, 2e-4]), rtol=1e-3)
+
+
+def test_who_is_silent_for_long_has_left_rather_than_stayed():
+    seen, about = updated(Tracks.none(2), TWO, Detection(0.0, np.zeros(2), np.eye(2)), np.array([0])), habits(leave_hz=0.001)
+    moments = np.linspace(0.0, 1500.0, 30_001)
+    # by Bayes: the share of leaving times that lie before the end, among all ways to be silent
+    staying = np.exp([log_silence(seen, habits(), moment)[0][0, 0] for moment in moments])
+    leaving = np.trapezoid(about.leave_hz * np.exp(-about.leave_hz * moments) * staying, moments)
+    stayed = np.exp(-about.leave_hz * moments[-1]) * staying[-1]
+    assert left_by(seen, about, 0.0)[0, 0] == 0.0
+    np.testing.assert_allclose(left_by(seen, about, 1500.0)[0, 0], leaving / (leaving + stayed), atol=0.02)
+
+
+def test_an_agents_rate_is_relearned_where_rates_change():
+    """Ten detections every 10 s, then twenty every 100 s: with a short memory the last ones are no surprise any more."""
+    for memory, fewest, most in ((1.0, 0.012, 0.02), (0.75, 0.0095, 0.0115)):
+        tracks = Tracks.none(2)
+        for time_s in np.concatenate([10.0 * np.arange(10), 90.0 + 100.0 * np.arange(1, 21)]):
+            tracks = updated(tracks, TWO, Detection(time_s, np.zeros(2), np.eye(2)), np.array([0]), memory)
+        about = dataclasses.replace(habits(), rate_weight=1.0)
+        rate_hz = np.exp(log_silence(tracks, about, float(tracks.last_s[0, 0]))[1][0, 0])
+        assert fewest < rate_hz < most
 
 
 @pytest.mark.parametrize("num", [1, 2, 5, 9])
