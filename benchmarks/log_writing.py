@@ -295,12 +295,12 @@ def encode_point_by_point(time_ns: int, found: list[Entity]) -> bytes:
     return data
 
 
-def point_by_point(time_ns: int, found: list[Entity]) -> SceneUpdate:
+def point_by_point(time_ns: int, found: list[Entity], frame_id: str = "map") -> SceneUpdate:
     """The message of `encode_scene`, built with the published classes."""
     update = SceneUpdate()
     update.deletions.add(type=SceneEntityDeletion.ALL).timestamp.FromNanoseconds(time_ns)
     for entity in found:
-        out = update.entities.add(frame_id="map", id=entity.id)
+        out = update.entities.add(frame_id=frame_id, id=entity.id)
         out.timestamp.FromNanoseconds(time_ns)
         for spheres in entity.spheres:
             for center in spheres.center_m:

@@ -6,39 +6,10 @@ from foxglove_schemas_protobuf.LinePrimitive_pb2 import LinePrimitive
 from foxglove_schemas_protobuf.SceneEntityDeletion_pb2 import SceneEntityDeletion
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 
+from benchmarks.log_writing import point_by_point
 from pipeline.logs.scene import Entity, Label, Lines, LineType, Spheres, encode_scene, encode_time, round_positions
 
 TIME_NS = 1_700_000_000_250_000_000
-
-
-def reference(time_ns, frame_id, entities):
-    """The same message, built point by point with the published classes."""
-    update = SceneUpdate()
-    deletion = update.deletions.add(type=SceneEntityDeletion.ALL)
-    deletion.timestamp.FromNanoseconds(time_ns)
-    for entity in entities:
-        out = update.entities.add(frame_id=frame_id, id=entity.id)
-        out.timestamp.FromNanoseconds(time_ns)
-        for spheres in entity.spheres:
-            for center in spheres.center_m:
-                sphere = out.spheres.add()
-                sphere.pose.position.x, sphere.pose.position.y, sphere.pose.position.z = center
-                sphere.pose.orientation.w = 1.0
-                sphere.size.x = sphere.size.y = sphere.size.z = spheres.diameter_m
-                sphere.color.r, sphere.color.g, sphere.color.b, sphere.color.a = spheres.color
-        for lines in entity.lines:
-            for points, color in zip(lines.point_m, lines.color, strict=True):
-                line = out.lines.add(type=int(lines.type), thickness=lines.thickness_px, scale_invariant=True)
-                line.pose.orientation.w = 1.0
-                for x, y, z in points:
-                    line.points.add(x=x, y=y, z=z)
-                line.color.r, line.color.g, line.color.b, line.color.a = color
-        for label in entity.labels:
-            text = out.texts.add(billboard=True, font_size=14.0, scale_invariant=True, text=label.text)
-            text.pose.position.x, text.pose.position.y, text.pose.position.z = label.position_m
-            text.pose.orientation.w = 1.0
-            text.color.r, text.color.g, text.color.b, text.color.a = label.color
-    return update
 
 
 def scene(rng, *, num_lines=5, num_points=7, z_m=12.5):
@@ -61,13 +32,13 @@ def scene(rng, *, num_lines=5, num_points=7, z_m=12.5):
 @pytest.mark.parametrize("num_points", [1, 2, 7, 200])
 def test_bytes_equal_those_of_the_published_classes(num_points):
     entities = scene(np.random.default_rng(1), num_points=num_points)
-    assert encode_scene(TIME_NS, "map", entities) == reference(TIME_NS, "map", entities).SerializeToString()
+    assert encode_scene(TIME_NS, "map", entities) == point_by_point(TIME_NS, entities).SerializeToString()
 
 
 def test_flat_scene_leaves_out_z_and_still_equals():
     entities = scene(np.random.default_rng(2), z_m=0.0)
     flat = encode_scene(TIME_NS, "map", entities)
-    assert SceneUpdate.FromString(flat) == reference(TIME_NS, "map", entities)
+    assert SceneUpdate.FromString(flat) == point_by_point(TIME_NS, entities)
     assert len(flat) < 0.8 * len(encode_scene(TIME_NS, "map", scene(np.random.default_rng(2))))
 
 
@@ -78,7 +49,7 @@ def test_zeros_anywhere_parse_to_the_same_message():
     ]
     entities += scene(rng)
     entities[1].lines[0].point_m[0, :, 0] = 0.0
-    assert SceneUpdate.FromString(encode_scene(TIME_NS, "", entities)) == reference(TIME_NS, "", entities)
+    assert SceneUpdate.FromString(encode_scene(TIME_NS, "", entities)) == point_by_point(TIME_NS, entities, "")
 
 
 def test_message_without_entities_only_deletes():
@@ -117,7 +88,7 @@ def test_encoding_is_much_faster_than_point_by_point():
         return min(times)
 
     fast = best_of(lambda: encode_scene(TIME_NS, "map", entities), 5)
-    slow = best_of(lambda: reference(TIME_NS, "map", entities).SerializeToString(), 2)
+    slow = best_of(lambda: point_by_point(TIME_NS, entities).SerializeToString(), 2)
     print(f"point by point / vectorised = {slow / fast:.0f}")
     assert slow > 5 * fast
 
