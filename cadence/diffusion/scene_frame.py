@@ -229,4 +229,4 @@ def future_of(track: Tensor, config: SceneConfig) -> Tensor:
 
 def _over(span: Tensor, like: Tensor) -> Tensor:
     """Spans [R, P] to stand beside [R, ..., P, 2]."""
-    return span.reshape(len(span), *(1,) * (like.ndim - 3), -1, 1).to(like.dtype)
+    return span.reshape(len(span), *(1,) * (like.ndim - 3), span.shape[-1], 1).to(like.dtype)

@@ -221,6 +221,14 @@ def test_what_is_told_follows_the_shares() -> None:
     assert len(scene_windows(rec, rows, CONFIG, Dropout(0.0, 0.0, 0.0), rng)) < 400  # before the first detection
 
 
+def test_of_a_source_there_may_be_no_window_at_all() -> None:
+    rec = recordings()
+    unseen = dataclasses.replace(rec, is_detected=np.zeros_like(rec.is_detected))
+    rng = np.random.default_rng(0)
+    found = scene_windows(unseen, np.array([30, 50]), CONFIG, Dropout(known_start=0.0), rng)
+    assert len(found) == 0 and found.clean.shape == (0, CONFIG.num_pieces, 2)
+
+
 def test_both_losses_fall_on_one_batch() -> None:
     batch, config = training_windows(), dataclasses.replace(CONFIG, few_steps=2)
     for objective in ("diffusion", "energy"):
