@@ -1,6 +1,7 @@
 """What all tests share: one thread (results depend on the number of threads), repeatable property tests, optional data."""
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -22,3 +23,15 @@ def shared_data() -> Path:
     if not SHARED_DATA.is_dir():
         pytest.skip("needs the recorded logs in ../shared/data")
     return SHARED_DATA
+
+
+@pytest.fixture
+def write_log(tmp_path: Path) -> Callable[..., Path]:
+    """Writes bytes to a file of the test's own, `log.mcap` unless named otherwise, and returns its path."""
+
+    def write(data: bytes, name: str = "log.mcap") -> Path:
+        path = tmp_path / name
+        path.write_bytes(data)
+        return path
+
+    return write

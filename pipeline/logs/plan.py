@@ -88,3 +88,8 @@ class LooseRun:
     def block(self) -> Block:
         """The block of the records so far."""
         return Block(self.begin, self.end - self.begin, "loose", self.first, self.last, dict(self.counts))
+
+
+def is_span(start: int, end: int) -> bool:
+    """Whether times from the header of a chunk, which no checksum covers, can be a span."""
+    return 0 < start <= end < 2**63

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from mcap.opcode import Opcode
 
-from pipeline.logs.plan import Block, LooseRun, Loss, Plan
+from pipeline.logs.plan import Block, LooseRun, Loss, Plan, is_span
 from pipeline.logs.records import (
     CHUNK_HEAD,
     CHUNK_HEAD_BYTES,
@@ -38,7 +38,7 @@ from pipeline.logs.records import (
 )
 from pipeline.logs.resync import find_records
 from pipeline.logs.rows import Index, Rows, agrees, leading_rows, rows_at, rows_by_index, rows_by_walk
-from pipeline.logs.summary import parse_summary_record, prefer_index, read_summary
+from pipeline.logs.summary import parse_summary_record, prefer_index, read_summary, unconfirmed
 
 LOOSE_BLOCK_BYTES: Final = 2**20
 """Messages outside chunks are planned in stretches of about this size."""
@@ -165,7 +165,8 @@ class _Scanner:
         if opcode == Opcode.DATA_END:
             self._take_data_end(offset, self._read(offset, length))
         elif opcode == Opcode.ATTACHMENT:
-            self._check_attachment(offset, length)
+            if length < 28:
+                raise DamagedRecord("an attachment is too short")
         elif opcode <= Opcode.DATA_END:
             parse_summary_record(opcode, self._read(offset, length))
             self.plan.doubts.append("The end mark of the data is missing.")
@@ -264,7 +265,7 @@ class _Scanner:
             self._flush_loose()
             self.plan.blocks.append(block)
         reason = f"the file ends inside this chunk; the {saved} messages at its beginning were saved"
-        self.plan.losses.append(Loss(offset - HEAD.size, reason, (start, end) if _is_span(start, end) else None))
+        self.plan.losses.append(Loss(offset - HEAD.size, reason, (start, end) if is_span(start, end) else None))
         self.position = self.size
 
     def _block_of_chunk(self, offset: int, length: int, data: bytes, has_checksum: bool = True, is_cut: bool = False) -> Block:
@@ -326,10 +327,6 @@ class _Scanner:
         self.plan.has_checksums = expected != 0 or (self.plan.has_checksums and not has_loose)
         self.plan.reached_end = True
 
-    def _check_attachment(self, offset: int, length: int) -> None:
-        if length < 28:
-            raise DamagedRecord("an attachment is too short")
-
     def _flush_loose(self) -> None:
         run, self.loose = self.loose, LooseRun()
         if run.begin >= 0:
@@ -340,7 +337,7 @@ class _Scanner:
         index = self.plan.summary.chunks.get(offset) if self.plan.summary else None
         if index is not None:
             return index.message_start_time, index.message_end_time
-        return (start, end) if _is_span(start, end) else None
+        return (start, end) if is_span(start, end) else None
 
     def _resume(self, reason: str) -> None:
         """After damage at the position: note the loss, go on at the next place that can be believed."""
@@ -365,7 +362,7 @@ class _Scanner:
         if len(data) < HEAD.size + CHUNK_HEAD.size or data[0] != Opcode.CHUNK:
             return None
         start, end, *_ = CHUNK_HEAD.unpack_from(data, HEAD.size)
-        return (start, end) if _is_span(start, end) else None
+        return (start, end) if is_span(start, end) else None
 
     def _cross_check(self) -> None:
         """Compare with what the summary says."""
@@ -380,6 +377,7 @@ class _Scanner:
             if self.num_unknown:
                 plan.doubts.append(f"{self.num_unknown} unknown records were skipped; no statistics tell whether any mattered.")
         if summary is None:
+            self._confirm_definitions()
             return
         plan.doubts += prefer_index("Channel", plan.channels, summary.channels)
         plan.doubts += prefer_index("Schema", plan.schemas, summary.schemas)
@@ -391,7 +389,10 @@ class _Scanner:
                 span = (index.message_start_time, index.message_end_time)
                 plan.losses.append(Loss(offset, "the chunk that the index names is not there", span))
 
-
-def _is_span(start: int, end: int) -> bool:
-    """Whether times from the header of a chunk, which no checksum covers, can be a span."""
-    return 0 < start <= end < 2**63
+    def _confirm_definitions(self) -> None:
+        """Without checksums the names of channels are believed only where a damaged index repeats them."""
+        if self.plan.reached_end and not self.plan.has_checksums:
+            tail = self._read(self.position, min(self.size - self.position, _MAX_SMALL_BYTES))
+            if num := len(unconfirmed(self.definitions, tail)):
+                words = "of channels or schemas are not repeated by the damaged index, and no checksum covers them"
+                self.plan.doubts.append(f"{num} definitions {words}.")

@@ -2,7 +2,7 @@
 
 import struct
 import zlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Set
 from dataclasses import dataclass, field
 from typing import BinaryIO, Final, TypeVar
 
@@ -73,6 +73,14 @@ def prefer_index(kind: str, known: dict[int, _Definition], indexed: Mapping[int,
             doubts.append(f"{kind} {number} differs between the data and the index; the index was used.")
             known[number] = record
     return doubts
+
+
+def unconfirmed(definitions: Set[bytes], tail: bytes) -> set[bytes]:
+    """Those of `definitions`, opcode and body, that are not repeated in `tail`, the bytes of an index that is damaged."""
+    missing = set(definitions)
+    for opcode, begin, end in walk(tail, is_cut=True):
+        missing.discard(bytes([opcode]) + tail[begin:end])
+    return missing
 
 
 def _read(file: BinaryIO, size: int) -> Summary:

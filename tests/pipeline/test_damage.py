@@ -13,6 +13,7 @@ from typing import Any
 
 import pytest
 from encoded_logs import CONTAINERS, encoded_log
+from mcap.writer import CompressionType
 from recorder_fixture import FORMS, carried, content, recording, reference
 
 from cadence.errors import InputError
@@ -170,6 +171,20 @@ def test_the_mere_beginning_of_a_log_copied_as_text(num_bytes: int, scratch: Pat
         assert not open_log(scratch).health.is_complete
     except InputError as error:
         assert num_bytes < 7 and "\n" not in str(error)
+
+
+@pytest.mark.parametrize("opcode", [3, 4])
+def test_names_that_nothing_confirms_are_doubted(opcode: int, scratch: Path) -> None:
+    """Without checksums, and with an index that cannot be used: a name that it does not repeat may be wrong."""
+    whole = recording(compression=CompressionType.NONE, enable_crcs=False)[:-8]
+    scratch.write_bytes(whole)
+    health = open_log(scratch).health
+    assert health.is_complete and "cannot be used" in health.problems[0]
+    damaged = bytearray(whole)
+    damaged[whole.index({3: b"Item", 4: b"/b"}[opcode]) + 1] ^= 1
+    scratch.write_bytes(damaged)
+    health = open_log(scratch).health
+    assert not health.is_complete and health.problems[0].startswith("1 definitions of channels or schemas are not repeated")
 
 
 def test_other_line_ends_are_named(scratch: Path) -> None:

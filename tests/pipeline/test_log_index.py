@@ -27,16 +27,6 @@ MESSAGES = {form: reference(data) for form, data in WHOLE.items()}
 METADATA = "rosbag2_bagfile_information:\n  relative_file_paths:\n    - bag_0.mcap\n    - bag_1.mcap\n    - bag_2.mcap\n"
 
 
-@pytest.fixture
-def write(tmp_path):
-    def write_bytes(data: bytes, name: str = "log.mcap"):
-        path = tmp_path / name
-        path.write_bytes(data)
-        return path
-
-    return write_bytes
-
-
 @pytest.fixture(scope="module")
 def scratch(tmp_path_factory):
     return tmp_path_factory.mktemp("indexes") / "log.mcap"
@@ -62,10 +52,10 @@ def one_by_one(log: MissionLog, **selection) -> list[tuple]:
 
 @pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize("disorder", [0, 7, NUM_MESSAGES])
-def test_columns_hold_what_the_messages_hold(form, disorder, write):
+def test_columns_hold_what_the_messages_hold(form, disorder, write_log):
     shuffle = random.Random(disorder)
     order = sorted(range(NUM_MESSAGES), key=lambda i: i + shuffle.uniform(0, disorder))
-    log = open_log(write(recording(order=order, **FORMS[form])))
+    log = open_log(write_log(recording(order=order, **FORMS[form])))
     for topics in (None, {"/b"}, {"/a", "/c"}, {"/nothing"}):
         assert in_columns(log, topics=topics) == one_by_one(log, topics=topics)
     steps: list[int] = []
@@ -93,8 +83,8 @@ def test_time_range_is_that_of_the_reference_reader(form, begin, length, offset,
     assert in_columns(logs[form], start_ns=start, end_ns=end) == one_by_one(logs[form], start_ns=start, end_ns=end)
 
 
-def test_only_chunks_in_the_time_range_are_unpacked(write, monkeypatch):
-    log = open_log(write(recording()))
+def test_only_chunks_in_the_time_range_are_unpacked(write_log, monkeypatch):
+    log = open_log(write_log(recording()))
     unpacked = []
     monkeypatch.setattr(timeline, "unpack_chunk", lambda chunk: unpacked.append(chunk.start_ns) or unpack_chunk(chunk))
     (message,) = log.messages(start_ns=START_NS + 50 * STEP_NS, end_ns=START_NS + 50 * STEP_NS + 1)
@@ -103,8 +93,8 @@ def test_only_chunks_in_the_time_range_are_unpacked(write, monkeypatch):
 
 
 @pytest.mark.parametrize("form", INDEXED)
-def test_sound_chunks_are_not_walked(form, write, monkeypatch):
-    path = write(recording(**FORMS[form]))
+def test_sound_chunks_are_not_walked(form, write_log, monkeypatch):
+    path = write_log(recording(**FORMS[form]))
     for module in (salvage, timeline):
         monkeypatch.setattr(module, "rows_by_walk", lambda *_: pytest.fail("walked"))
     assert len(list(open_log(path).messages())) == NUM_MESSAGES
@@ -164,7 +154,7 @@ def test_a_message_index_that_lies_is_noticed_and_costs_nothing(form, data, scra
     assert content(reopen([scratch], log.health)) == found
 
 
-def test_index_of_another_chunk_is_noticed(write):
+def test_index_of_another_chunk_is_noticed(write_log):
     """Message indexes of one chunk are copied over those of another with the same channels."""
     whole = recording(compression=CompressionType.NONE)
     first, second = chunk_indexes(whole)[1:3]
@@ -172,25 +162,25 @@ def test_index_of_another_chunk_is_noticed(write):
     assert first.message_index_length == second.message_index_length
     damaged = bytearray(whole)
     damaged[begins[1] : begins[1] + second.message_index_length] = whole[begins[0] : begins[0] + first.message_index_length]
-    log = open_log(write(bytes(damaged)))
+    log = open_log(write_log(bytes(damaged)))
     assert content(log) == reference(whole) and log.health.is_complete
     assert log.health.problems == ("1 chunks differ from their message indexes, which were not used.",)
 
 
 @pytest.mark.parametrize("held", [1, 3000, timeline.MAX_HELD_BYTES])
 @pytest.mark.parametrize("disorder", [5, NUM_MESSAGES])
-def test_few_bytes_are_held_where_chunks_overlap(held, disorder, write, monkeypatch):
+def test_few_bytes_are_held_where_chunks_overlap(held, disorder, write_log, monkeypatch):
     """With hardly any room, chunks are read again and again, and the messages are still the same."""
     shuffle = random.Random(disorder)
     order = sorted(range(NUM_MESSAGES), key=lambda i: i + shuffle.uniform(0, disorder))
-    log = open_log(write(recording(order=order)))
+    log = open_log(write_log(recording(order=order)))
     monkeypatch.setattr(timeline, "MAX_HELD_BYTES", held)
     assert [m.sequence for m in log.messages()] == list(range(NUM_MESSAGES))
     assert [m.sequence for m in log.messages({"/b"})] == list(range(1, NUM_MESSAGES, 3))
 
 
-def test_a_loop_that_stops_early_leaves_nothing_open(write):
-    path = write(recording())
+def test_a_loop_that_stops_early_leaves_nothing_open(write_log):
+    path = write_log(recording())
     for message in open_log(path).messages():
         if message.sequence == 3:
             break
@@ -198,8 +188,8 @@ def test_a_loop_that_stops_early_leaves_nothing_open(write):
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_reopened_log_is_the_log(form, write, monkeypatch):
-    path = write(recording(**FORMS[form]))
+def test_reopened_log_is_the_log(form, write_log, monkeypatch):
+    path = write_log(recording(**FORMS[form]))
     log = open_log(path)
     if form in INDEXED:
         monkeypatch.setattr(salvage, "unpack_chunk", lambda _: pytest.fail("unpacked"))
@@ -208,7 +198,7 @@ def test_reopened_log_is_the_log(form, write, monkeypatch):
     assert content(again) == content(log) and again.metadata() == log.metadata() and again.health == log.health
 
 
-def test_index_without_every_message_is_left_to_the_walk(write):
+def test_index_without_every_message_is_left_to_the_walk(write_log):
     file = io.BytesIO()
     writer = Writer(file, chunk_size=100)
     writer.start()
@@ -217,11 +207,11 @@ def test_index_without_every_message_is_left_to_the_walk(write):
         writer.add_message(channel, i, b"%60d" % i, i)
     writer._Writer__chunk_indices.pop()
     writer.finish()
-    assert plan_by_index(write(file.getvalue())) is None
-    assert plan_by_index(write(recording(has_summary=False))) is None
-    assert plan_by_index(write(recording()[:-30])) is None
-    assert plan_by_index(write(recording())) is not None
-    assert plan_by_index(write(b"").with_name("gone.mcap")) is None
+    assert plan_by_index(write_log(file.getvalue())) is None
+    assert plan_by_index(write_log(recording(has_summary=False))) is None
+    assert plan_by_index(write_log(recording()[:-30])) is None
+    assert plan_by_index(write_log(recording())) is not None
+    assert plan_by_index(write_log(b"").with_name("gone.mcap")) is None
 
 
 def split(tmp_path, bounds=(0, 50, 70, NUM_MESSAGES), interleaved=False):

@@ -4,9 +4,11 @@ import tarfile
 
 import pytest
 from mcap.reader import make_reader
+from mcap.writer import Writer
 from recorder_fixture import FORMS, NUM_MESSAGES, START_NS, STEP_NS, content, recording, reference
 
 from cadence.errors import InputError
+from pipeline.logs import salvage
 from pipeline.logs.reader import open_log, utc
 
 REAL = [
@@ -23,16 +25,6 @@ REAL = [
 ]
 
 
-@pytest.fixture
-def write(tmp_path):
-    def write_bytes(data: bytes, name: str = "log.mcap"):
-        path = tmp_path / name
-        path.write_bytes(data)
-        return path
-
-    return write_bytes
-
-
 @pytest.mark.parametrize("name", REAL)
 def test_real_log_reads_as_by_the_reference_reader(name, shared_data):
     path = shared_data / name
@@ -47,13 +39,13 @@ def test_real_log_reads_as_by_the_reference_reader(name, shared_data):
     assert content(log) == reference(path.read_bytes())
 
 
-def test_conformance_logs_all_read_as_by_the_reference_reader(shared_data, write):
+def test_conformance_logs_all_read_as_by_the_reference_reader(shared_data, write_log):
     num_logs = 0
     with tarfile.open(shared_data / "formats" / "conformance.tar.gz") as archive:
         for member in archive:
             data = archive.extractfile(member).read() if member.isfile() else b""
             if member.name.endswith(".mcap"):
-                log = open_log(write(data))
+                log = open_log(write_log(data))
                 assert log.health.is_complete and not log.health.problems, member.name
                 assert content(log) == reference(data), member.name
                 num_logs += 1
@@ -61,9 +53,9 @@ def test_conformance_logs_all_read_as_by_the_reference_reader(shared_data, write
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_every_form_of_recording_reads_alike(form, write):
+def test_every_form_of_recording_reads_alike(form, write_log):
     data = recording(**FORMS[form])
-    log = open_log(write(data))
+    log = open_log(write_log(data))
     assert log.health.is_complete and not log.health.problems and log.health.has_checksums
     assert log.health.num_messages == NUM_MESSAGES
     assert (log.start_ns, log.end_ns) == (START_NS, START_NS + (NUM_MESSAGES - 1) * STEP_NS)
@@ -76,19 +68,17 @@ def test_every_form_of_recording_reads_alike(form, write):
 
 @pytest.mark.parametrize("form", ["zstd", "plain", "unchunked", "zstd without summary"])
 @pytest.mark.parametrize("disorder", [3, 40, NUM_MESSAGES])
-def test_messages_come_in_log_time_order_however_they_were_written(form, disorder, write):
+def test_messages_come_in_log_time_order_however_they_were_written(form, disorder, write_log):
     shuffle = random.Random(disorder)
     order = sorted(range(NUM_MESSAGES), key=lambda i: i + shuffle.uniform(0, disorder))
-    log = open_log(write(recording(order=order, **FORMS[form])))
+    log = open_log(write_log(recording(order=order, **FORMS[form])))
     times = [message.log_time_ns for message in log.messages()]
     assert times == [START_NS + i * STEP_NS for i in range(NUM_MESSAGES)]
-    assert sorted(content(log)) == sorted(content(open_log(write(recording(**FORMS[form]), "other.mcap"))))
+    assert sorted(content(log)) == sorted(content(open_log(write_log(recording(**FORMS[form]), "other.mcap"))))
 
 
 def test_messages_at_one_time_keep_the_order_of_the_file(tmp_path):
     path = tmp_path / "log.mcap"
-    from mcap.writer import Writer
-
     with path.open("wb") as file:
         writer = Writer(file, chunk_size=200)
         writer.start()
@@ -99,11 +89,37 @@ def test_messages_at_one_time_keep_the_order_of_the_file(tmp_path):
     assert [message.sequence for message in open_log(path).messages()] == list(range(40))
 
 
+def test_messages_of_all_sizes_outside_chunks_are_read_many_at_once(write_log, monkeypatch):
+    """Small and large ones, definitions, metadata and times that cannot be used between them; the checksum is continued."""
+    sizes = random.Random(1)
+    file = io.BytesIO()
+    writer = Writer(file, use_chunking=False, enable_data_crcs=True)
+    writer.start()
+    ids = [writer.register_channel("/first", "json", 0)]
+    for i in range(4000):
+        if i % 1300 == 700:
+            ids.append(writer.register_channel(f"/later/{i}", "json", 0))
+            writer.add_metadata("place", {"i": str(i)})
+        size = 2**21 if i == 2000 else 30_000 if i % 50 == 9 else sizes.randrange(300)
+        writer.add_message(ids[i % len(ids)], 2**63 if i == 3000 else i // 3, bytes(size), i, i)
+    writer.finish()
+    one_by_one = []
+    record = salvage._Scanner._record
+    monkeypatch.setattr(salvage._Scanner, "_record", lambda self: one_by_one.append(self.position) or record(self))
+    log = open_log(write_log(file.getvalue()))
+    assert content(log) == [message for message in reference(file.getvalue()) if message[3] < 2**63]
+    assert log.health.problems[0] == "1 messages have log times after the year 2262 and cannot be used."
+    assert len(one_by_one) < 100 and len(log.metadata()) == 3
+    damaged = bytearray(file.getvalue())
+    damaged[len(damaged) // 2] ^= 1
+    assert "checksum over all data" in " ".join(open_log(write_log(bytes(damaged))).health.problems)
+
+
 @pytest.mark.parametrize("topics", [None, {"/a"}, set()])
 @pytest.mark.parametrize("form", FORMS)
-def test_progress_adds_up_to_the_size_of_the_file(form, topics, write):
+def test_progress_adds_up_to_the_size_of_the_file(form, topics, write_log):
     steps: list[int] = []
-    path = write(recording(**FORMS[form]))
+    path = write_log(recording(**FORMS[form]))
     log = open_log(path, steps.append)
     assert sum(steps) == log.size_bytes == path.stat().st_size and min(steps) >= 0
     steps.clear()
@@ -111,8 +127,8 @@ def test_progress_adds_up_to_the_size_of_the_file(form, topics, write):
     assert sum(steps) == log.size_bytes and min(steps) >= 0
 
 
-def test_log_without_messages_opens(write):
-    log = open_log(write(recording(num_messages=0)))
+def test_log_without_messages_opens(write_log):
+    log = open_log(write_log(recording(num_messages=0)))
     assert (log.start_ns, log.end_ns, log.health.num_messages, log.health.is_complete) == (0, 0, 0, True)
     assert list(log.messages()) == []
 
@@ -128,9 +144,9 @@ def test_log_without_messages_opens(write):
         (b"\x1f\x8b" + bytes(100), "gzip"),
     ],
 )
-def test_what_is_no_mcap_is_refused_in_one_line(data, words, write):
+def test_what_is_no_mcap_is_refused_in_one_line(data, words, write_log):
     with pytest.raises(InputError, match=words) as error:
-        open_log(write(data))
+        open_log(write_log(data))
     assert "log.mcap" in str(error.value) and "\n" not in str(error.value)
 
 
@@ -141,15 +157,15 @@ def test_absent_file_and_folder_are_refused(tmp_path):
         open_log(tmp_path)
 
 
-def test_magic_alone_opens_as_a_damaged_log(write):
-    log = open_log(write(b"\x89MCAP0\r\n"))
+def test_magic_alone_opens_as_a_damaged_log(write_log):
+    log = open_log(write_log(b"\x89MCAP0\r\n"))
     assert not log.health.is_complete and log.health.num_messages == 0 and log.health.problems
 
 
 @pytest.mark.parametrize("form", ["zstd", "unchunked"])
-def test_file_that_changes_while_it_is_read_is_an_input_error(form, write):
+def test_file_that_changes_while_it_is_read_is_an_input_error(form, write_log):
     data = recording(**FORMS[form])
-    path = write(data)
+    path = write_log(data)
     log = open_log(path)
     path.write_bytes(data[: len(data) // 2])
     with pytest.raises(InputError, match="changed"):
