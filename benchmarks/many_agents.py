@@ -12,7 +12,6 @@ import os
 import subprocess
 import sys
 import tempfile
-import time
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -33,7 +32,6 @@ class Peak:
     num_windows: int
     num_agents: int
     num_tracks: int
-    wall_s: float
     bytes: int
 
 
@@ -57,12 +55,10 @@ def peak_of(log: Path, preset: str) -> Peak:
             "infer.grid.stride_steps": STRIDE_STEPS,
         }  # fmt: skip
         words = [word for key, value in settings.items() for word in ("--set", f"{key}={value}")]
-        begin = time.perf_counter()
         usage = _run(["run", str(log), "--out", out, "--quiet", *words])
-        wall_s = time.perf_counter() - begin
         summary = json.loads((Path(out) / log.stem / "infer.manifest.json").read_text())["summary"]
     counts = (summary["num_windows"], summary["num_agents"], summary["num_tracks"])
-    return Peak(preset, *counts, wall_s, usage)
+    return Peak(preset, *counts, usage)
 
 
 def _run(words: list[str]) -> int:
@@ -91,7 +87,7 @@ def main() -> int:
     for peak in peaks:
         name = "bank alone" if peak.preset == "none" else peak.preset
         counts = f"{peak.num_agents} | {peak.num_windows} | {peak.num_tracks}"
-        text += f"| {name} | {counts} | {peak.wall_s:.0f} | {peak.bytes / 1e9:.2f} |\n"
+        text += f"| {name} | {counts} | {peak.bytes / 1e9:.2f} |\n"
     text += f"\nUnder {LIMIT_GB:g} GB: {'holds' if holds else 'does not hold'}.\n"
     sys.stdout.write(text)
     if arguments.publish is not None:
@@ -110,8 +106,8 @@ HEAD = f"""# How much memory do many agents take?
 process of its own. GB are 10^9 bytes. Tracks are the rows
 of hypotheses.parquet: a track for each window, hypothesis and agent that was detected within the window.
 
-| checkpoint | agents | windows | tracks | wall time, s | peak, GB |
-|---|---|---|---|---|---|
+| checkpoint | agents | windows | tracks | peak, GB |
+|---|---|---|---|---|
 """
 
 
