@@ -1,8 +1,11 @@
 """Tiny batches, run in processes that can be killed: they are forked from one that has imported everything already."""
 
+import contextlib
 import multiprocessing
 import os
 import signal
+import subprocess
+import sys
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 
@@ -41,6 +44,27 @@ def start(*arguments: object) -> BaseProcess:
     process = _context.Process(target=run_command, args=arguments if "--workers" in arguments else (*arguments, "--workers", 0))
     process.start()
     return process
+
+
+MARK = "CADENCE_TEST_RUN"
+"""Environment variable by which the processes of a command are found, whoever their parent is by now."""
+
+
+def start_command(mark: str, *arguments: object) -> subprocess.Popen[str]:
+    """`cadence run` with tiny settings from a shell of its own: Ctrl-C there reaches every process of it."""
+    words = [sys.executable, str(Path(cli.__file__)), "run", *map(str, arguments), *FLAGS]
+    environment = {**os.environ, MARK: mark}
+    return subprocess.Popen(words, env=environment, stderr=subprocess.PIPE, text=True, start_new_session=True)
+
+
+def processes_of(mark: str) -> list[str]:
+    """What still runs of a command, and is no zombie."""
+    found = []
+    for process in Path("/proc").glob("[0-9]*"):
+        with contextlib.suppress(OSError):
+            if f"{MARK}={mark}".encode() in (process / "environ").read_bytes().split(b"\0"):
+                found.append((process / "cmdline").read_text().replace("\0", " "))
+    return found
 
 
 def results_of(out: Path) -> dict[str, str]:

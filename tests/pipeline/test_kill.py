@@ -1,17 +1,19 @@
-"""Kill -9 at random moments: what is there is never half, and a run that goes on ends with the same bytes.
+"""Kill -9 at random moments, Ctrl-C, SIGTERM: what is there is never half, and a run that goes on ends with the same bytes.
 
-`CADENCE_KILLS=50` tries more moments.
+`CADENCE_KILLS=50` tries more moments, and Ctrl-C on Ray.
 """
 
 import json
 import os
 import random
+import signal
 import time
 from pathlib import Path
 
 import pytest
-from batch_fixture import hidden_in, results_of, start, write_tiny_logs
+from batch_fixture import hidden_in, processes_of, results_of, start, start_command, write_tiny_logs
 
+from pipeline.locks import locked
 from pipeline.manifest import hash_file
 
 pytestmark = pytest.mark.timeout(300)  # on a busy machine the first process takes long to import everything
@@ -88,6 +90,45 @@ def test_two_runs_on_one_folder_do_not_harm_each_other(undisturbed, tmp_path):
         process.join()
     assert [process.exitcode for process in both] == [0, 0]
     assert results_of(tmp_path / "out") == whole and hidden_in(tmp_path / "out") == []
+
+
+@pytest.mark.parametrize(
+    ("engine", "number", "is_long"),
+    [
+        ("local", signal.SIGINT, False),
+        ("local", signal.SIGTERM, False),
+        ("ray", signal.SIGTERM, False),
+        ("ray", signal.SIGINT, True),
+    ],
+)
+def test_stopped_with_workers_it_leaves_none_and_can_be_resumed(undisturbed, tmp_path, engine, number, is_long):
+    if engine == "ray":
+        pytest.importorskip("ray", reason="needs the extra ray")
+    if is_long and "CADENCE_KILLS" not in os.environ:
+        pytest.skip("takes long: set CADENCE_KILLS")
+    logs, whole, _ = undisturbed
+    out, mark = tmp_path / "out", str(tmp_path)
+    with locked(out / "b"):  # while we hold it, the run cannot end by itself
+        command = start_command(mark, logs, "--out", out, "--workers", 2, "--engine", engine)
+        while not list(out.glob("a/*")) and command.poll() is None:
+            time.sleep(0.005)
+        assert len(processes_of(mark)) > 2
+        begin_s = time.monotonic()
+        if number == signal.SIGINT:
+            os.killpg(command.pid, number)  # as a terminal does it
+        else:
+            command.send_signal(number)
+        _, said = command.communicate(timeout=60)
+    assert command.returncode == 130
+    assert said == "cadence: interrupted; finished stages are kept, the same command continues after them\n"
+    while processes_of(mark) and time.monotonic() < begin_s + 60:
+        time.sleep(0.05)
+    assert processes_of(mark) == []
+    assert_nothing_is_half(out, whole)
+    assert hidden_in(out) == [] or engine == "ray"  # whose workers are killed
+    again = start(logs, "--out", out)
+    again.join()
+    assert again.exitcode == 0 and results_of(out) == whole and hidden_in(out) == []
 
 
 def test_terminated_it_clears_up_and_says_how_to_go_on(undisturbed, tmp_path):
