@@ -6,6 +6,7 @@ import os
 import signal
 import threading
 import time
+from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
@@ -14,14 +15,16 @@ from typing import Literal
 
 from tqdm import tqdm
 
-from cadence.errors import UsageError
+from cadence.errors import CadenceError, UsageError
 from pipeline.batch import STAGES, Engine, LogOutcome, LogTask, RunConfig, exit_code, plan_tasks, run_tasks
 from pipeline.engines.local import run_in_processes, run_in_sequence
 from pipeline.engines.ray import run_on_ray
-from pipeline.manifest import manifest_path
+from pipeline.ingest import CATALOGUE_NAME, Catalogue, read_catalogue
+from pipeline.manifest import hash_file, manifest_path
 from pipeline.progress import Progress, Told
-from pipeline.remote import run_anywhere, write_text
+from pipeline.remote import SOURCE_NAME, run_anywhere, write_text
 from pipeline.summaries import batch_record, to_json
+from pipeline.urls import is_url
 
 REPORT_NAME = "batch.json"
 _WORKER_BYTES = 2_000_000_000
@@ -45,6 +48,8 @@ def run(
     chosen = choose_engine(engine, len(tasks), num_workers)
     if len(tasks) > 1:
         progress.note(_plan_line(tasks))
+    for line in _renamed(tasks, out):
+        progress.note(line)
     with _interruptible(), contextlib.closing(_Shown(tasks, progress)) as shown:
         outcomes = run_tasks(tasks, chosen, shown.finished, shown.watch, run_anywhere)
     text = to_json(batch_record(outcomes, exit_code(outcomes), time.monotonic() - started_s)) + "\n"
@@ -78,6 +83,22 @@ def _plan_line(tasks: Sequence[LogTask]) -> str:
     size = tqdm.format_sizeof(sum(task.size_bytes for task in tasks), "B")
     num_finished = sum(manifest_path(STAGES[-1], Path(task.directory)).is_file() for task in tasks)
     return f"{len(tasks)} missions, {size}; {num_finished} were finished earlier, and are skipped where nothing has changed"
+
+
+def _renamed(tasks: Sequence[LogTask], out: str) -> Iterator[str]:
+    """A line for each log on disk that is new in `out`, where one of the same content was run, and is gone from its place."""
+    new = [t for t in tasks if len(t.parts) == 1 and not any(map(is_url, (*t.parts, out))) and not Path(t.directory).exists()]
+    gone = defaultdict[int, list[tuple[Catalogue, Path]]](list)
+    for path in sorted(Path(out).glob(f"*/{CATALOGUE_NAME}")) if new else ():
+        with contextlib.suppress(CadenceError):
+            found = read_catalogue(path.parent)
+            if found.path.parent.name != SOURCE_NAME and not found.path.exists():
+                gone[found.size_bytes].append((found, path.parent))
+    for task in new:
+        digest = hash_file(Path(task.parts[0])) if task.size_bytes in gone else ""
+        for found, directory in gone[task.size_bytes]:
+            if found.sha256 == digest:
+                yield f"{task.log}: is {found.path.name} renamed; it is run anew, as results bear its name; {directory} stays"
 
 
 class _Shown:

@@ -128,6 +128,21 @@ def test_what_is_done_is_skipped_also_from_another_number_of_workers(tmp_path):
     assert [outcome.status for outcome in (*first, *again)] == ["done", "skipped"]
 
 
+def test_a_moved_log_is_not_inferred_again_and_of_a_renamed_one_it_is_said(tmp_path, capsys):
+    logs = write_tiny_logs(tmp_path / "logs", 1)
+    config = stage_config(RunConfig, None, None, [f"{name}={value}" for name, value in SETTINGS.items()])
+    run([str(logs / "a.mcap")], str(tmp_path / "out"), config, QUIET)
+    (tmp_path / "moved").mkdir()
+    moved = (logs / "a.mcap").rename(tmp_path / "moved" / "a.mcap")
+    (outcome,) = run([str(moved)], str(tmp_path / "out"), config, Progress())
+    assert outcome.task.directory == str(tmp_path / "out" / "a") and "renamed" not in capsys.readouterr().err
+    assert {stage.stage for stage in outcome.stages if stage.status == "skipped"} >= {"infer"}
+    renamed = moved.rename(moved.with_name("b.mcap"))
+    (outcome,) = run([str(renamed)], str(tmp_path / "out"), config, Progress())
+    assert outcome.status == "done" and f"{renamed}: is a.mcap renamed; it is run anew" in capsys.readouterr().err
+    assert (tmp_path / "out" / "a" / "report.html").is_file()
+
+
 def test_one_log_needs_no_worker_and_more_have_some():
     assert choose_engine("local", 1, None) is run_in_sequence
     assert choose_engine("local", 5, 0) is run_in_sequence
