@@ -22,13 +22,14 @@ from pipeline.run import run
 from pipeline.simulate import SimulateConfig, simulate
 
 QUIET = Progress(quiet=True)
-SIMULATED = ("simulate.patrol.duration_s=600", "simulate.patrol.detection_rate=0.3")
+SEED = 7
+SIMULATED = ("simulate.patrol.duration_s=1800", "simulate.patrol.detection_rate=0.4")  # long enough that all are detected
 SETTINGS = ("infer.num_hypotheses=5", "infer.grid.stride_steps=64", "export.tick_s=30")
 
 
 def make_logs(folder: Path, num_logs: int) -> list[str]:
-    """Simulated missions of ten minutes."""
-    config = stage_config(SimulateConfig, "simulate", None, [*SIMULATED, f"simulate.num_episodes={num_logs}"], 7)
+    """Simulated missions of half an hour."""
+    config = stage_config(SimulateConfig, "simulate", None, [*SIMULATED, f"simulate.num_episodes={num_logs}"], SEED)
     return [str(path) for path in simulate(folder, config, QUIET).outputs]
 
 
@@ -53,6 +54,7 @@ def main() -> int:
     parser.add_argument("--checkpoint", default="none", help="name of a checkpoint; none: the bank alone")
     parser.add_argument("--publish", type=Path, help="folder for batch_engines.md")
     arguments = parser.parse_args()
+    num_running = os.getloadavg()[0]
     with tempfile.TemporaryDirectory() as work:
         folder = Path(work)
         logs = make_logs(folder / "logs", arguments.num_logs)
@@ -67,8 +69,12 @@ def main() -> int:
     made_with = ", ".join(f"{name} {number}" for name, number in versions().items())
     text = HEAD.format(
         num_logs=len(logs), workers=arguments.workers, checkpoint=arguments.checkpoint, versions=made_with,
-        cpus=len(os.sched_getaffinity(0)),
+        cpus=len(os.sched_getaffinity(0)), num_running=num_running, seed=SEED, num_windows=num_windows(local),
+        settings="`, `".join((*SIMULATED, *SETTINGS)),
     )  # fmt: skip
+    for outcome in (*local, *ray):
+        if outcome.message:
+            sys.stderr.write(f"{outcome.message}\n")
     text += f"| missions that went through, local and Ray | {done(local)} and {done(ray)} of {len(logs)} |\n"
     text += f"| hypotheses.parquet with the same bytes | {num_same} of {len(logs)} |\n"
     text += f"| all files with the same bytes | {num_files} of {len(files[0])} |\n"
@@ -84,13 +90,21 @@ def done(outcomes: tuple[LogOutcome, ...]) -> int:
     return sum(outcome.status == "done" for outcome in outcomes)
 
 
+def num_windows(outcomes: tuple[LogOutcome, ...]) -> int:
+    """Windows of all missions together."""
+    return sum(stage.summary["num_windows"] for outcome in outcomes for stage in outcome.stages if stage.stage == "infer")
+
+
 HEAD = """# Do local workers and Ray give the same hypotheses, and what does Ray cost?
 
     python benchmarks/batch_engines.py --num-logs {num_logs} --workers {workers} --checkpoint {checkpoint}
 
-{num_logs} simulated missions of ten minutes through `cadence run`, once with `--engine local` and once with `--engine ray` on
-the same machine ({cpus} hyperthreads), {workers} workers each, one thread a worker. Every file of every mission is hashed. The
-wall times include the start of the workers, and for Ray that of Ray itself. Checkpoint: {checkpoint}. Versions: {versions}.
+{num_logs} simulated missions of half an hour (seed {seed}, {num_windows} windows) through `cadence run`, once with `--engine
+local` and then with `--engine ray` on the same machine: {cpus} hyperthreads, load by other work at the start {num_running:.1f},
+{workers} workers each, one thread a worker. Every file of every mission is hashed. The wall times include the start of the
+workers, and for Ray that of Ray itself; where other work goes on, their ratio is rough. Settings:
+`{settings}`.
+Checkpoint: {checkpoint}. Versions: {versions}.
 
 | what | value |
 |---|---|
