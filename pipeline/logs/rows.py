@@ -84,10 +84,9 @@ class Rows:
         return self if mask.all() else self[mask]
 
     def by_time(self) -> "Rows":
-        """The rows by log time, then by place in the block."""
-        if (self.log_time_ns[1:] >= self.log_time_ns[:-1]).all() and (self.begin[1:] > self.begin[:-1]).all():
-            return self
-        return self[np.lexsort((self.begin, self.log_time_ns))]
+        """The rows, which are in the order of the block, by log time and then in that order."""
+        is_sorted = (self.log_time_ns[1:] >= self.log_time_ns[:-1]).all()
+        return self if is_sorted else self[np.argsort(self.log_time_ns, kind="stable")]
 
 
 def rows_by_walk(data: bytes, is_cut: bool = False) -> tuple[Rows, Definitions]:

@@ -59,13 +59,15 @@ class _Piece:
     block: Block
     rows: Rows
 
-    def split(self, bound: tuple[float, int, int]) -> tuple["_Piece", "_Piece"]:
-        """The rows before and after the beginning of another block (time, source, offset)."""
+    def split(self, bound: tuple[float, int, int]) -> tuple["_Piece", "_Piece | None"]:
+        """The rows before and, if any, after the beginning of another block (time, source, offset)."""
         if bound[0] == math.inf:
             place = len(self.rows)
         else:
             side: Literal["left", "right"] = "right" if self.key < bound[1:] else "left"
             place = int(np.searchsorted(self.rows.log_time_ns, np.uint64(bound[0]), side))
+        if place == len(self.rows):
+            return self, None
         return _Piece(self.key, self.block, self.rows[:place]), _Piece(self.key, self.block, self.rows[place:])
 
 
@@ -92,7 +94,7 @@ class Timeline:
             if waiting:
                 pairs = [piece.split(bound) for piece in waiting]
                 yield from self._in_order([ready for ready, _ in pairs if len(ready.rows)])
-                waiting = [rest for _, rest in pairs if len(rest.rows)]
+                waiting = [rest for _, rest in pairs if rest is not None]
                 self.held = {piece.key: self.held[piece.key] for piece in waiting if piece.key in self.held}
             self._advance(block)
         self._finish()
