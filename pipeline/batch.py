@@ -171,7 +171,7 @@ def _is_damaged(stages: Iterable[StageResult]) -> bool:
 
 
 def _is_nothing_detected(outcomes: Sequence[LogOutcome]) -> bool:
-    return all(outcome.status == "nothing detected" for outcome in outcomes)
+    return bool(outcomes) and all(outcome.status == "nothing detected" for outcome in outcomes)
 
 
 def _naming(task: LogTask, message: str) -> str:

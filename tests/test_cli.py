@@ -110,6 +110,23 @@ def test_flags_reach_the_stage(fake_infer, tmp_path):
     assert (config.num_hypotheses, config.seed) == (7, 9)
 
 
+def test_combined_is_a_setting_of_export(monkeypatch):
+    import pipeline.export
+    import pipeline.run
+
+    found = []
+    monkeypatch.setattr(pipeline.run, "run", lambda logs, out, config, *_: found.append(config.export.combined) or ())
+    monkeypatch.setattr(
+        pipeline.export,
+        "export",
+        lambda mission, config, *_: found.append(config.combined) or StageResult("export", "done", (), {}),
+    )
+    for words in (["run", "a.mcap", "--out", "o"], ["export", "m"]):
+        for flags in ([], ["--combined"], ["--combined", "--set", "export.tick_s=2"]):
+            assert cli.main([*words, *flags]) == 0
+    assert found == [False, True, True] * 2
+
+
 def test_results_are_on_stdout_for_people_or_as_json(fake_infer, capsys):
     fake_infer()
     assert cli.main(["infer", "m"]) == 0
