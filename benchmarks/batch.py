@@ -1,7 +1,7 @@
 """What do workers, and windows drawn together, bring to a batch, and do results depend on them?
 
-Simulated logs and five broken ones are run twice, by one worker and by several, into folders of their own, one run right after
-the other. Then windows of one log are drawn by the shipped `prison` checkpoint alone and together.
+Simulated logs and five broken ones among them are run twice, by one worker and by several, into folders of their own, one run
+right after the other. Then windows of one log are drawn by the shipped `prison` checkpoint alone and together.
 
     python benchmarks/batch.py --publish docs/benchmarks
 """
@@ -11,6 +11,7 @@ import os
 import sys
 import tempfile
 import time
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -30,7 +31,8 @@ from pipeline.windows import build_windows, plan_grid
 
 NUM_BROKEN = 5
 SIZES = (1, 2, 4, 8, 16)
-SIMULATE = ("simulate.patrol.duration_s=600", "simulate.patrol.detection_rate=0.3")
+SEED = 0
+SIMULATE = ("simulate.patrol.duration_s=1800", "simulate.patrol.detection_rate=0.4")  # long enough that all are detected
 SETTINGS = (
     "infer.checkpoint=none", "infer.num_hypotheses=4", "infer.grid.history_steps=16", "infer.grid.horizon_steps=16",
     "infer.grid.stride_steps=32", "infer.guidance.mode=none",
@@ -40,29 +42,44 @@ _QUIET = Progress(quiet=True)
 
 def write_logs(folder: Path, count: int) -> None:
     """`count` simulated logs, and broken ones between them."""
-    simulate(folder, stage_config(SimulateConfig, "simulate", None, [*SIMULATE, f"simulate.num_episodes={count}"]), _QUIET)
+    config = stage_config(SimulateConfig, "simulate", None, [*SIMULATE, f"simulate.num_episodes={count}"], SEED)
+    simulate(folder, config, _QUIET)
     sound = sorted(folder.glob("*.mcap"))[0].read_bytes()
     for number in range(NUM_BROKEN):
         content = (b"", b"not an MCAP", sound[:50], bytes(5000), sound[:8] + bytes(3000))[number]
-        (folder / f"patrol-0-{number * count // NUM_BROKEN:04d}-broken.mcap").write_bytes(content)
+        (folder / f"patrol-{SEED}-{number * count // NUM_BROKEN:04d}-broken.mcap").write_bytes(content)
 
 
-def batch_table(folder: Path, num_workers: int) -> list[str]:
-    """A row for each number of workers; every other run must give the same hypotheses as the first."""
+@dataclass(frozen=True)
+class Batches:
+    """The runs with one worker and with several: a row each, a row for every log that failed, and what was compared."""
+
+    rows: list[str]
+    failures: list[str]
+    num_files: int
+    num_windows: int
+
+
+def run_batches(folder: Path, num_workers: int) -> Batches:
+    """Run the logs by one worker and by several; raises `SystemExit` where the runs differ, or other logs fail."""
     config = stage_config(RunConfig, None, None, SETTINGS)
-    lines, first_s, first = [], 0.0, dict[str, str]()
-    run([str(next(folder.glob("logs/*.mcap")))], str(folder / "warm"), config, _QUIET, num_workers=1)  # imports once for all
+    rows, failures, first_s, first = [], list[str](), 0.0, dict[str, str]()
+    run(
+        [str(folder / f"logs/patrol-{SEED}-0000.mcap")], str(folder / "warm"), config, _QUIET, num_workers=1
+    )  # imports once for all
     for workers in (1, num_workers):
         out, begin_s = folder / f"workers-{workers}", time.monotonic()
         outcomes = run([str(folder / "logs")], str(out), config, _QUIET, num_workers=workers)
         elapsed_s = time.monotonic() - begin_s
-        found = {str(path.relative_to(out)): hash_file(path) for path in out.rglob("*.parquet")}
+        found = {str(path.relative_to(out)): hash_file(path) for path in out.glob("*/*")}
         first_s, first = first_s or elapsed_s, first or found
-        failed = [outcome for outcome in outcomes if outcome.exit_code]
-        if found != first or len(failed) != NUM_BROKEN or any("broken" not in outcome.message for outcome in failed):
-            raise SystemExit(f"batch: {workers} workers gave other results, or other failures than those of broken logs")
-        lines.append(f"| {workers} | {len(outcomes) - len(failed)} | {len(failed)} | {first_s / elapsed_s:.2f} | yes |")
-    return lines
+        told = {o.task.name: o.message.replace(f"{folder / 'logs'}/", "") for o in outcomes if o.status != "done"}
+        rows.append(f"| {workers} | {len(outcomes) - len(told)} | {len(told)} | {first_s / elapsed_s:.2f} | yes |")
+        failures = failures or [f"| {name} | {message} |" for name, message in told.items()]
+        if found != first or len(told) != NUM_BROKEN or not all(name.endswith("-broken") for name in told):
+            raise SystemExit("\n".join([f"batch: {workers} workers gave other files, or other logs failed:", *told]))
+    windows = [stage.summary["num_windows"] for o in outcomes for stage in o.stages if stage.stage == "infer"]
+    return Batches(rows, failures, len(first), sum(windows))
 
 
 def window_table(detections_path: Path, num_hypotheses: int = 30) -> list[str]:
@@ -92,19 +109,22 @@ def main() -> int:
     """Both tables, printed and published."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--publish", type=Path, help="folder for batch.md")
-    parser.add_argument("--logs", type=int, default=100, help="simulated logs")
+    parser.add_argument("--logs", type=int, default=100, help="logs, the broken ones included")
     parser.add_argument("--workers", type=int, default=max(2, len(os.sched_getaffinity(0))), help="of the second run")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
+    num_running = os.getloadavg()[0]
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        write_logs(folder / "logs", arguments.logs)
-        batch = batch_table(folder, arguments.workers)
+        write_logs(folder / "logs", arguments.logs - NUM_BROKEN)
+        batches = run_batches(folder, arguments.workers)
         detections = max((folder / "workers-1").glob("*/detections.parquet"), key=lambda path: (path.stat().st_size, path))
         windows = window_table(detections)
     text = HEAD.format(
         num_logs=arguments.logs, num_broken=NUM_BROKEN, cores=len(os.sched_getaffinity(0)), settings="`, `".join(SETTINGS),
-        simulate="`, `".join(SIMULATE), batch="\n".join(batch), windows="\n".join(windows),
+        simulate="`, `".join(SIMULATE), batch="\n".join(batches.rows), windows="\n".join(windows),
+        failures="\n".join(batches.failures), num_files=batches.num_files, num_windows=batches.num_windows,
+        num_running=num_running, seed=SEED,
         checkpoint=f"prison, {checkpoint_hash(find_checkpoint('prison'))}",
         versions=", ".join(f"{name} {number}" for name, number in versions().items()),
     )  # fmt: skip
@@ -118,14 +138,20 @@ HEAD = """# What do workers, and windows drawn together, bring to a batch?
 
     python benchmarks/batch.py
 
-{num_logs} simulated logs and {num_broken} broken ones among them, all stages; one thread a worker, {cores} logical cores.
-Speed is a ratio of wall times, one run right after the other, after a run of one log that is not counted. All Parquet files of
-the runs were compared byte by byte; every broken log failed with a line of its own, and nothing else did. Settings:
-`{simulate}`, `{settings}`.
+{num_logs} logs, {num_broken} of them broken, through all stages; one thread a worker, {cores} hyperthreads, load by other work
+at the start {num_running:.1f}. Sound logs are simulated missions of half an hour (seed {seed}), {num_windows} windows in all.
+Speed is a ratio of wall times, one run right after the other, after a run of one log that is not counted. All {num_files} files
+in the mission directories were compared byte by byte. Settings: `{simulate}`, `{settings}`.
 
 | workers | finished | failed | speed | same bytes |
 |---|---|---|---|---|
 {batch}
+
+What the batch says of the logs that failed:
+
+| log | message |
+|---|---|
+{failures}
 
 Windows of one log, 30 hypotheses each, drawn by the shipped checkpoint for the prison world, so many together; one thread,
 ratios of processor times. Draws of a window differ by rounding alone where few windows are drawn together, because matrix
