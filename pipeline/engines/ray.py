@@ -206,6 +206,8 @@ def _connected(ray: Any, num_workers: int | None) -> Iterator[None]:
     before = signal.getsignal(signal.SIGTERM)
     try:
         ray.init(address=address or "local", log_to_driver=False, logging_level=logging.ERROR, **local)
+    except SystemExit as error:  # its own way to end on SIGTERM, while it starts
+        raise KeyboardInterrupt from error
     except (ConnectionError, RuntimeError, ValueError, TimeoutError) as error:
         where = f"RAY_ADDRESS={address}" if address else "--engine ray"
         raise DeviceError(f"{where}: no Ray can be reached or started ({_reason(error)}); see `ray status`") from error

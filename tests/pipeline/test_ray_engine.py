@@ -5,6 +5,7 @@ import signal
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from logs_fixture import straight_line, write_log
@@ -134,6 +135,18 @@ class FakeRay:
 
     def cluster_resources(self):
         return self.resources
+
+
+def test_sigterm_while_ray_starts_is_an_interruption(monkeypatch):
+    def ends(**options):
+        raise SystemExit(signal.SIGTERM)
+
+    monkeypatch.delenv("RAY_ADDRESS", raising=False)
+    fake = SimpleNamespace(is_initialized=lambda: False, init=ends)
+    before = signal.getsignal(signal.SIGTERM)
+    with pytest.raises(KeyboardInterrupt), module._connected(fake, 2):
+        pytest.fail("it was not connected")
+    assert signal.getsignal(signal.SIGTERM) == before
 
 
 @pytest.mark.parametrize(
