@@ -335,8 +335,8 @@ A mixed log as a robot records it: {num} messages of ten topics (ROS 2, CDR), {s
 with its defaults (index, no checksums) and `mcap-ros2-support`; *ours* checks the checksum of every chunk that it reads.
 Both give the same messages in the same order, which the script verifies by a hash. A log that was checked before (by
 `cadence ingest`) is planned by its index; the third row is the first opening, which also compares every byte with checksums,
-indexes and statistics. Both use one thread. Where other work runs on the machine meanwhile, as when this page was made, only the
-ratios of CPU time tell anything.
+indexes and statistics. Both use one thread. Where other work runs on the machine meanwhile, as when this page was made, only
+the ratios of CPU time tell anything.
 
 Versions: {versions}.
 
