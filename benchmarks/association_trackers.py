@@ -19,8 +19,7 @@ from pipeline.manifest import write_atomic
 KINDS = ("GNN", "JPDA")
 NUM_SAMPLES = 60
 _EPOCH = datetime.datetime(2026, 1, 1)
-_STEP = 10.0**0.5
-_LEAST_DIFFUSION, _MOST_DIFFUSION = 1e-7, 10.0
+_FACTORS = {"diffusion": 10.0**0.5, "gate": 4.0 / 3.0, "patience_s": 2.0}
 
 
 @dataclass(frozen=True)
@@ -34,22 +33,19 @@ class Settings:
 
 
 def searched(kind: str, logs: Sequence[Log], starts: Sequence[Settings], folder: Path) -> Settings:
-    """The settings of least mean GOSPA on `logs`: from the best start on, one value after the other until none gets better.
+    """The settings of least mean GOSPA on `logs`: from the best start on one value after the other, as far as it gets better.
 
-    The range of the acceleration noise is open, so that the best lies within what was tried. One file a setting in `folder`.
+    Ranges are open, so that the best lies within what was tried. One file a setting in `folder`.
     """
-    found = {start: _mean_gospa(kind, logs, start, folder) for start in starts}
-    while True:
-        best = min(found, key=found.__getitem__)
-        near = [
-            *(replace(best, diffusion=float(f"{best.diffusion * factor:.2g}")) for factor in (1 / _STEP, _STEP)),
-            *(replace(best, gate=best.gate * factor) for factor in (0.75, 4 / 3)),
-            *(replace(best, patience_s=best.patience_s * factor) for factor in (0.5, 2.0)),
-        ]
-        tried = [one for one in near if one not in found and _LEAST_DIFFUSION <= one.diffusion <= _MOST_DIFFUSION]
-        found |= {one: _mean_gospa(kind, logs, one, folder) for one in tried}
-        if min(found.values()) == found[best]:
-            return best
+    best = min(starts, key=lambda start: _mean_gospa(kind, logs, start, folder))
+    for name, factor in _FACTORS.items():
+        for step in (1.0 / factor, factor):
+            while True:
+                further = replace(best, **{name: float(f"{getattr(best, name) * step:.2g}")})
+                if _mean_gospa(kind, logs, further, folder) >= _mean_gospa(kind, logs, best, folder):
+                    break
+                best = further
+    return best
 
 
 def _mean_gospa(kind: str, logs: Sequence[Log], settings: Settings, folder: Path) -> float:

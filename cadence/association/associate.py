@@ -7,7 +7,7 @@ from cadence.association.fitting import fit_habits
 from cadence.association.naming import named_like
 from cadence.association.particles import Particles, Stream, follow
 from cadence.association.presence import Habits
-from cadence.association.types import CLUTTER, AssociationConfig, Associations, agent_probability
+from cadence.association.types import CLUTTER, AssociationConfig, Associations
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -78,12 +78,24 @@ def _drawn(particles: Particles, num_ways: int, generator: np.random.Generator) 
 
 
 def _named(label: Integers, weight: Floats, reference: Integers) -> tuple[Integers, Floats]:
-    """The same ways with common names for their agents; first the one that agrees most with all, then the likeliest."""
-    label = np.stack([named_like(way, reference) for way in label])
-    label = np.stack([named_like(way, label[weight.argmax()]) for way in label])
-    probability = agent_probability(Associations(label, weight, int(label.max(initial=CLUTTER)) + 1))
-    agreement = probability[np.arange(label.shape[1]), label].sum(axis=1)  # the last column is clutter's, label -1
-    best = int(agreement.argmax())
+    """The same ways with common names for their agents; first the one that agrees most with all on who was whose next."""
+    before = _predecessors(label)
+    best = int(np.argmax([weight @ (before == way).sum(axis=1) for way in before]))
     order = np.argsort(-weight - (np.arange(len(weight)) == best), kind="stable")
-    label = label[order]
-    return np.stack([label[0], *(named_like(way, label[0]) for way in label[1:])]), weight[order]
+    first = named_like(label[best], reference)
+    return np.stack([first, *(named_like(way, first) for way in label[order[1:]])]), weight[order]
+
+
+def _predecessors(label: Integers) -> Integers:
+    """The detection of the same agent before each one [M, N]: -1 for none, -2 for clutter.
+
+    Ways that differ early by an exchange of two agents agree on most of these later on, which names alone would not tell.
+    """
+    rows = np.arange(len(label))
+    last = np.full((len(label), int(label.max(initial=CLUTTER)) + 2), -1)
+    out = np.empty_like(label)
+    for number in range(label.shape[1]):
+        agent = label[:, number]
+        out[:, number] = np.where(agent == CLUTTER, -2, last[rows, agent])
+        last[rows, agent] = number
+    return out
