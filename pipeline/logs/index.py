@@ -4,7 +4,6 @@ An index may begin with what another file says of its own data (see `append`), o
 """
 
 import struct
-import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Final
@@ -12,6 +11,7 @@ from typing import Final
 from mcap import records
 from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
+from zlib_ng.zlib_ng import crc32
 
 from pipeline.logs.records import HEAD, MAGIC
 
@@ -115,5 +115,5 @@ class Index:
                 offsets += encode_record(offset)
                 summary += groups[opcode]
         footer = _FOOTER.pack(Opcode.FOOTER, _FOOTER.size - HEAD.size + 4, position, position + len(summary))
-        checksum = zlib.crc32(footer, zlib.crc32(summary + offsets))
+        checksum = crc32(footer, crc32(summary + offsets))
         return bytes(summary + offsets + footer + struct.pack("<I", checksum) + MAGIC)

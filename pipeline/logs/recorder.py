@@ -1,7 +1,6 @@
 """The data section of an MCAP under construction: messages into compressed, checked and indexed chunks."""
 
 import struct
-import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import BinaryIO, Final, Literal
@@ -11,6 +10,7 @@ import numpy as np
 import zstandard
 from mcap import records
 from mcap.opcode import Opcode
+from zlib_ng.zlib_ng import crc32
 
 from pipeline.logs.index import Index, encode_record
 from pipeline.logs.records import MAGIC, MESSAGE_HEAD
@@ -104,7 +104,7 @@ class Recorder:
         self._file.write(data)
         self._position += len(data)
         if self._checksum is not None:
-            self._checksum = zlib.crc32(data, self._checksum)
+            self._checksum = crc32(data, self._checksum)
         return offset
 
     def _end_chunk(self) -> None:
@@ -117,7 +117,7 @@ class Recorder:
         name = "" if self._packing.compression == "none" else self._packing.compression
         chunk = records.Chunk(
             compression=name, data=packed, message_start_time=first_ns, message_end_time=last_ns,
-            uncompressed_crc=zlib.crc32(self._chunk), uncompressed_size=len(self._chunk),
+            uncompressed_crc=crc32(self._chunk), uncompressed_size=len(self._chunk),
         )  # fmt: skip
         encoded = encode_record(chunk)
         offset = self._put(encoded)

@@ -7,7 +7,6 @@ allocate much.
 
 import contextlib
 import struct
-import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from io import BytesIO
@@ -21,6 +20,7 @@ from mcap import records
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import EndOfFile, McapError
 from mcap.opcode import Opcode
+from zlib_ng.zlib_ng import crc32
 
 MAGIC: Final = b"\x89MCAP0\r\n"
 TEXT_MAGIC: Final = b"\x89MCAP0\n"
@@ -143,7 +143,7 @@ def unpack_chunk(chunk: PackedChunk) -> bytes:
         raise DamagedRecord(f"it declares {chunk.uncompressed_size} bytes, more than the limit of {MAX_CHUNK_BYTES}")
     with damage():
         data = _decompress(chunk)
-    if chunk.crc and zlib.crc32(data) != chunk.crc:
+    if chunk.crc and crc32(data) != chunk.crc:
         raise DamagedRecord("its checksum does not match")
     if not chunk.crc and len(data) != chunk.uncompressed_size:
         raise DamagedRecord(f"it holds {len(data)} bytes instead of {chunk.uncompressed_size}")

@@ -6,7 +6,6 @@ plan of what is left. Chunks are decompressed one at a time and their CRCs check
 
 import bisect
 import struct
-import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import BinaryIO, Final
@@ -14,6 +13,7 @@ from typing import BinaryIO, Final
 import numpy as np
 import numpy.typing as npt
 from mcap.opcode import Opcode
+from zlib_ng.zlib_ng import crc32
 
 from pipeline.logs.plan import Block, LooseRun, Loss, Plan, is_span
 from pipeline.logs.records import (
@@ -81,7 +81,7 @@ class _Scanner:
         """Fill the plan."""
         self.position = self._magic_length()
         if self.position == len(MAGIC) and self._states_checksum():
-            self.crc = zlib.crc32(MAGIC)
+            self.crc = crc32(MAGIC)
         while self.position < self.limit and not self.plan.reached_end:
             try:
                 if self.previous == MESSAGE:
@@ -129,11 +129,11 @@ class _Scanner:
             self.broken_chunk = self.unchecked = None
         body = self._take(opcode, offset + HEAD.size, length)
         if not self.plan.reached_end and self.crc is not None:
-            self.crc = zlib.crc32(head, self.crc)
+            self.crc = crc32(head, self.crc)
             if body is None:
                 self.crc = self._crc_of_rest(self.crc, offset + HEAD.size, length)
             else:
-                self.crc = zlib.crc32(body, self.crc)
+                self.crc = crc32(body, self.crc)
         self.previous, self.position = opcode, end
 
     def _states_checksum(self) -> bool:
@@ -145,7 +145,7 @@ class _Scanner:
 
     def _crc_of_rest(self, crc: int, offset: int, length: int) -> int:
         for begin in range(offset, offset + length, _READ_BYTES):
-            crc = zlib.crc32(self._read(begin, min(_READ_BYTES, offset + length - begin)), crc)
+            crc = crc32(self._read(begin, min(_READ_BYTES, offset + length - begin)), crc)
         return crc
 
     def _take(self, opcode: int, offset: int, length: int) -> bytes | None:
@@ -204,7 +204,7 @@ class _Scanner:
         if length:
             self._add_loose(self.position, length, rows)
             if self.crc is not None:
-                self.crc = zlib.crc32(memoryview(data)[:length], self.crc)
+                self.crc = crc32(memoryview(data)[:length], self.crc)
             self.position += length
         is_over = length < len(data) and data[length] != MESSAGE
         self.window = _MIN_WINDOW_BYTES if is_over else min(2 * self.window, LOOSE_BLOCK_BYTES)

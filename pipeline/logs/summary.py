@@ -1,7 +1,6 @@
 """The index at the end of an MCAP: read whole, its checksum verified, or not believed at all."""
 
 import struct
-import zlib
 from collections.abc import Callable, Iterator, Mapping, Set
 from dataclasses import dataclass, field
 from typing import BinaryIO, Final, TypeVar
@@ -9,6 +8,7 @@ from typing import BinaryIO, Final, TypeVar
 from mcap import records
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
+from zlib_ng.zlib_ng import crc32
 
 from pipeline.logs.records import HEAD, MAGIC, DamagedRecord, StrictStream, damage, parse_channel, parse_schema, walk
 
@@ -100,7 +100,7 @@ def _read(file: BinaryIO, size: int) -> Summary:
         raise DamagedRecord("the footer points nowhere")
     file.seek(begin)
     data = file.read(footer_offset - begin)
-    if crc and zlib.crc32(footer[: _FOOTER.size - 4], zlib.crc32(data)) != crc:
+    if crc and crc32(footer[: _FOOTER.size - 4], crc32(data)) != crc:
         raise DamagedRecord("its checksum does not match")
     summary = Summary(begin)
     for number, body in _bodies(data):
