@@ -94,8 +94,10 @@ def _renamed(tasks: Sequence[LogTask], out: str) -> Iterator[str]:
             found = read_catalogue(path.parent)
             if found.path.parent.name != SOURCE_NAME and not found.path.exists():
                 gone[found.size_bytes].append((found, path.parent))
-    for task in new:
-        digest = hash_file(Path(task.parts[0])) if task.size_bytes in gone else ""
+    for task in [task for task in new if task.size_bytes in gone]:
+        digest = ""
+        with contextlib.suppress(CadenceError):  # a log that cannot be read says so itself, later
+            digest = hash_file(Path(task.parts[0]))
         for found, directory in gone[task.size_bytes]:
             if found.sha256 == digest:
                 yield f"{task.log}: is {found.path.name} renamed; it is run anew, as results bear its name; {directory} stays"
