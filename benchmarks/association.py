@@ -211,13 +211,13 @@ class Rival:
         return {f"{self.kind} + RTS (Stone Soup)": tracked(self.kind, self.settings, log)}
 
 
-def table(case: Case, jobs: int) -> list[str]:
-    """The section of one case."""
+def table(case: Case, jobs: int, further: dict[str, Estimator]) -> list[str]:
+    """The section of one case, with further estimators by the folder of their scores."""
     folder = WORK / case.name
     with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
         settings = dict(zip(KINDS, pool.map(searched_for, [(kind, case) for kind in KINDS]), strict=True))
         estimators: dict[str, Estimator] = {"known": known, "ours": ours}
-        estimators |= {"run": recorded} if case.name == "ships" else {}
+        estimators |= further
         estimators |= {kind: Rival(kind, chosen) for kind, chosen in settings.items()}
         work = [
             (folder / name / f"log{index}.json", log, one)
@@ -273,6 +273,7 @@ def main() -> int:
     parser.add_argument("--episodes", type=int, default=20)
     parser.add_argument("--jobs", type=int, default=2, help="processes")
     parser.add_argument("--without-ships", action="store_true", help="leave out the recorded ships, which take longest")
+    parser.add_argument("--without-run", action="store_true", help="leave out `cadence run` on the ships")
     parser.add_argument("--publish", type=Path, help="folder for association.md")
     arguments = parser.parse_args()
     from pipeline.provenance import versions
@@ -283,9 +284,10 @@ def main() -> int:
         episodes=arguments.episodes,
         versions=", ".join(f"{n} {v}" for n, v in versions().items()),
     )
-    text += "\n".join(table(rendezvous_case(arguments.episodes), arguments.jobs)) + "\n"
+    text += "\n".join(table(rendezvous_case(arguments.episodes), arguments.jobs, {})) + "\n"
+    further: dict[str, Estimator] = {} if arguments.without_run else {"run": recorded}
     if SHIPS.is_file() and not arguments.without_ships:
-        text += SHIPS_HEAD + "\n".join(table(ships_case(), arguments.jobs)) + "\n"
+        text += SHIPS_HEAD + RUN_HEAD * len(further) + "\n".join(table(ships_case(), arguments.jobs, further)) + "\n"
     sys.stdout.write(text)
     if arguments.publish is not None:
         write_atomic(arguments.publish / "association.md", text)
@@ -325,9 +327,12 @@ SHIPS_HEAD = """
 12 % of the reports, 15 m noise; the number of ships is told to nobody. A track exists from its first to its last detection.
 Two ships lie within 20 m of each other at one berth from the 5th to the 41st minute, and five to seven have another one within
 300 m most of the time: much of who is who cannot be known, and what is said of it should be as unsure as that.
-Cut-off c = 100 m. *cadence run* is the pipeline with the general checkpoint, end to end, with half as many windows as by
-default: each moment is read from the first window whose origin lies at least two minutes later (at most four), so that this row
-knows less than the others; labels are those of the last window. The other rows of this project are the bank alone.
+Cut-off c = 100 m. The rows of this project are the bank alone.
+
+"""
+RUN_HEAD = """*cadence run* is the pipeline with the general checkpoint, end to end, with half as many windows as by default:
+each moment is read from the first window whose origin lies at least two minutes later (at most four), so that this row knows
+less than the others; labels are those of the last window.
 
 """
 
