@@ -280,6 +280,7 @@ def main() -> int:
 
     text = HEAD.format(
         num_ways=NUM_WAYS,
+        flags=" --without-run" * arguments.without_run,
         seed=HELD_OUT_SEED,
         episodes=arguments.episodes,
         versions=", ".join(f"{n} {v}" for n, v in versions().items()),
@@ -296,7 +297,7 @@ def main() -> int:
 
 HEAD = """# Who tells targets apart where a log does not say which detection came from whom?
 
-    python benchmarks/association.py
+    python benchmarks/association.py{flags}
 
 One stream of detections without identity, all of it known (retrospective). *Association* is this project's: ways to read the
 stream by a particle filter, the detections that a way gives to an agent smoothed by the bank; the way that agrees most with
@@ -327,7 +328,8 @@ SHIPS_HEAD = """
 12 % of the reports, 15 m noise; the number of ships is told to nobody. A track exists from its first to its last detection.
 Two ships lie within 20 m of each other at one berth from the 5th to the 41st minute, and five to seven have another one within
 300 m most of the time: much of who is who cannot be known, and what is said of it should be as unsure as that.
-Cut-off c = 100 m. The rows of this project are the bank alone.
+Cut-off c = 100 m. The rows of this project are the bank alone. Its association was developed on other episodes of rendezvous
+and with a look at the first half of this log.
 
 """
 RUN_HEAD = """*cadence run* is the pipeline with the general checkpoint, end to end, with half as many windows as by default:
