@@ -346,7 +346,7 @@ Versions: {versions}.
 SHARES = """
 ## Where the time goes
 
-Each row holds all rows above it; *at most* is the ratio if nothing else had to be done. `zlib` computes the checksums.
+Each row holds all rows above it; *at most* is the ratio if nothing else had to be done. zlib-ng computes the checksums.
 
 | reading all messages | CPU s | share | at most |
 |---|---|---|---|
