@@ -1,7 +1,8 @@
 """Names of agents that hold over all ways to read a log and over all window origins.
 
 Every way numbers its agents as it meets them. Here they get the names of the agents of a way that was named before, matched
-by the detections that both give to them (the assignment of greatest overlap).
+by the detections that both give to them (the assignment of greatest overlap). The last ones count most: of two ways that part
+early, by an exchange of two agents, names are to say who is where now.
 """
 
 import numpy as np
@@ -11,6 +12,9 @@ from scipy.optimize import linear_sum_assignment
 from cadence.association.types import CLUTTER
 
 Integers = NDArray[np.int64]
+
+_FORGETTING = 0.8
+"""What a detection counts, to the power of how many later ones of the same agent there are, in either way."""
 
 
 def named_like(label: Integers, reference: Integers) -> Integers:
@@ -23,7 +27,8 @@ def named_like(label: Integers, reference: Integers) -> Integers:
     both = label[: len(reference)]
     is_pair = (both != CLUTTER) & (reference != CLUTTER)
     index = both[is_pair] * num_other + reference[is_pair]
-    overlap = np.bincount(index, minlength=num_own * num_other).reshape(num_own, num_other)
+    counts = _FORGETTING ** (_num_later(both) + _num_later(reference))[is_pair]
+    overlap = np.bincount(index, counts, minlength=num_own * num_other).reshape(num_own, num_other)
     name = np.full(num_own + 1, CLUTTER)  # the last entry answers for clutter
     rows, columns = linear_sum_assignment(-overlap)
     is_match = overlap[rows, columns] > 0
@@ -32,3 +37,12 @@ def named_like(label: Integers, reference: Integers) -> Integers:
     free = np.setdiff1d(np.arange(num_own + num_other), name)
     name[nameless] = free[: len(nameless)]
     return np.asarray(name[label], dtype=np.int64)
+
+
+def _num_later(label: Integers) -> Integers:
+    """How many later detections [N] have the same label."""
+    order = np.argsort(label[::-1], kind="stable")
+    grouped = label[::-1][order]
+    later = np.empty_like(label)
+    later[order] = np.arange(len(label)) - np.searchsorted(grouped, grouped)
+    return later[::-1]

@@ -144,6 +144,16 @@ def test_names_follow_the_greater_overlap():
     np.testing.assert_array_equal(named_like(np.array([0, 1, 0]), np.zeros(0, dtype=np.int64)), [0, 1, 0])
 
 
+def test_names_say_who_is_where_now_after_an_exchange_long_ago():
+    reference = np.tile([0, 1], 30)
+    exchanged = np.where(np.arange(60) < 40, 1 - reference, reference)  # the larger part, but the earlier one
+    np.testing.assert_array_equal(named_like(exchanged, reference), exchanged)
+    np.testing.assert_array_equal(named_like(1 - exchanged, reference), exchanged)
+    # an agent that ended long ago does not keep the name from the one that goes on with it
+    other = np.concatenate([np.full(20, 3), np.full(20, 4)])
+    np.testing.assert_array_equal(named_like(other, np.zeros(40, dtype=np.int64))[-1], 0)
+
+
 def test_names_stay_from_origin_to_origin():
     time, place, _ = two_lines(num=30)
     found = read(time, place, origins=time[4:])
