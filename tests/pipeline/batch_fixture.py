@@ -54,7 +54,14 @@ def start_command(mark: str, *arguments: object) -> subprocess.Popen[str]:
     """`cadence run` with tiny settings from a shell of its own: Ctrl-C there reaches every process of it."""
     words = [sys.executable, str(Path(cli.__file__)), "run", *map(str, arguments), *FLAGS]
     environment = {**os.environ, MARK: mark}
-    return subprocess.Popen(words, env=environment, stderr=subprocess.PIPE, text=True, start_new_session=True)
+    return subprocess.Popen(
+        words, env=environment, stderr=subprocess.PIPE, text=True, start_new_session=True, preexec_fn=_heed_interrupts
+    )
+
+
+def _heed_interrupts() -> None:
+    """What a shell starts in the background ignores Ctrl-C, and hands that down; a command from a terminal does not."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 def processes_of(mark: str) -> list[str]:
