@@ -305,8 +305,7 @@ def _stored_grid(stored: MissionHypotheses, directory: Path) -> Grid:
     origins_ns = np.array([window.origin_ns for window in stored.windows], dtype=np.int64)
     first = drawn[0]
     return Grid(
-        first.step_ns, first.origin_index + 1, first.num_steps - first.origin_index - 1, origins_ns,
-        _infer_config(directory).grid.context_steps,
+        first.step_ns, first.origin_index + 1, first.num_steps - first.origin_index - 1, origins_ns, _context_steps(directory)
     )  # fmt: skip
 
 
@@ -324,6 +323,13 @@ def _collision_test(directory: Path, windows: MissionWindows) -> IsInside | None
         return hit
 
     return collides
+
+
+def _context_steps(directory: Path) -> int | None:
+    """How far back infer read detections, which is for its checkpoint to say: rivals get the same."""
+    told = (read_manifest("infer", directory) or {}).get("summary", {})
+    steps: int | None = told.get("context_steps", _infer_config(directory).grid.context_steps)
+    return steps
 
 
 def _infer_config(directory: Path) -> InferConfig:

@@ -137,6 +137,7 @@ def infer(directory: Path, config: InferConfig, progress: Progress, force: bool 
             "num_tracks": tracks.num_rows,
             "status": {str(item["values"]): int(item["counts"]) for item in counts},
             "step_s": plan.seen.sources.grid.step_s,
+            "context_steps": plan.seen.sources.grid.context_steps,
             "checkpoint": config.checkpoint,
             "checkpoint_sha256": None if weights is None else checkpoint_hash(weights),
             "seed": config.seed,

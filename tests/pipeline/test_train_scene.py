@@ -16,6 +16,7 @@ from cadence.network.scene import SceneNetworkConfig
 from cadence.training.loop import OptimiserConfig
 from cadence.worlds.recordings import Recordings, cut_windows
 from pipeline.checkpoints import read_info
+from pipeline.evaluate import EvaluateConfig, evaluate
 from pipeline.infer import GuidanceConfig, InferConfig, infer
 from pipeline.progress import Progress
 from pipeline.recordings import RecordingsConfig, save_recordings
@@ -24,7 +25,7 @@ from pipeline.tables import Frame, read_table, write_table
 from pipeline.train import TrainConfig, train
 from pipeline.train_scene import SceneTraining
 from pipeline.training_episodes import EpisodeSource
-from schemas.tables import DETECTIONS
+from schemas.tables import DETECTIONS, TRUTH
 
 QUIET = Progress(quiet=True)
 START_NS = 1_700_000_000_000_000_000
@@ -114,6 +115,24 @@ def test_infer_takes_a_scene_checkpoint(sources, tmp_path, mission_directory):
     other = dataclasses.replace(settings, scene=SceneSampling(sampler="few"))
     with pytest.raises(ConfigError, match="not tuned"):
         infer(mission_directory, other, QUIET)
+
+
+def test_all_that_infer_saw_is_seen_by_those_it_is_compared_with(sources, tmp_path, mission_directory):
+    weights = train(tmp_path / "scene", config(sources), QUIET).outputs[0]
+    infer(mission_directory, InferConfig(num_hypotheses=3, checkpoint=str(weights), scene=SceneSampling(num_steps=2)), QUIET)
+    rows = [
+        {"log_id": "walk", "time_ns": START_NS + minute * 60 * 10**9, "agent_id": agent, "x_m": 30.0 * minute, "y_m": y_m}
+        for minute in range(300) for agent, y_m in (("T0", 0.0), ("T1", 500.0))
+    ]  # fmt: skip
+    truth = pa.Table.from_pylist(rows, schema=TRUTH)
+    write_table(truth, mission_directory / "truth.parquet", "truth", Frame("map", None, None))
+    evaluate(mission_directory, EvaluateConfig(rivals=("cv",), num_resamples=20), QUIET)
+    report = json.loads((mission_directory / "scores.json").read_text())
+    asked = ("future", "part", "ade_m")
+    found = {row["estimator"]: row for row in report["rows"] if (row["part"], row["by"], row["metric"]) == asked}
+    # at the origins at least one agent was seen minutes ago, which a rival without memory could say nothing of
+    num_drawn = read_table(mission_directory / "hypotheses.parquet", "hypotheses")[0].num_rows // 3
+    assert found["cadence"]["num_cells"] == found["cv"]["num_cells"] == 119 * num_drawn
 
 
 def test_the_limits_of_all_presets_hold_for_a_scene_checkpoint(sources, tmp_path, mission_directory):
