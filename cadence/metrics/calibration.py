@@ -18,6 +18,10 @@ from torch import Tensor
 _MAX_PAIRS = 8_000_000
 
 
+_SAME_PLACE_M = 1e-3
+"""Points so near to the truth are tied with it: hypotheses that all pass through an exact detection are stored in float32."""
+
+
 def coverage(position_m: Tensor, weight: Tensor, truth_m: Tensor, levels: Sequence[float] = (0.5, 0.9)) -> Tensor:
     """Whether the region of each level holds the truth [len(levels), B, A, T], in [0, 1] (a fraction on its border).
 
@@ -55,6 +59,7 @@ def _rank_rows(points: Tensor, mass: Tensor) -> tuple[Tensor, Tensor]:
     density = _left_out_density(_whiten(points, mass), mass)
     truth = density[:, :1]
     is_tied = (density - truth).abs() <= 1e-9 * truth.abs()
+    is_tied |= torch.linalg.vector_norm(points - points[:, :1], dim=-1) <= _SAME_PLACE_M
     low = torch.where(~is_tied & (density > truth), mass, 0.0).sum(dim=1)
     return low, low + torch.where(is_tied, mass, 0.0).sum(dim=1)
 

@@ -181,6 +181,8 @@ def test_coverage_of_equal_samples() -> None:
     same = torch.zeros(1, 30, 1, 1, 2)
     assert metrics.coverage(same, uniform(1, 30), torch.ones(1, 1, 1, 2)).flatten().tolist() == [0.0, 0.0]
     assert metrics.coverage(same, uniform(1, 30), torch.zeros(1, 1, 1, 2)).flatten().tolist() == pytest.approx([0.5, 0.9])
+    rounded = torch.full((1, 1, 1, 2), 2e-4)  # what float32 makes of an exact detection far from the datum
+    assert metrics.coverage(same, uniform(1, 30), rounded).flatten().tolist() == pytest.approx([0.5, 0.9])
 
 
 def test_step_lengths_by_hand() -> None:
