@@ -41,8 +41,8 @@ STAGE = "forecast"
 BLOCK = 200
 """Windows that are sampled and scored at once, and kept."""
 
-SCORES_FORMAT = 1
-"""Of the kept blocks."""
+SCORES_FORMAT = 2
+"""Of the kept blocks; since 2 hypotheses at the truth's place are tied with it."""
 
 
 @dataclass(frozen=True)

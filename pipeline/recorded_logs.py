@@ -81,15 +81,15 @@ def read_log_episodes(path: Path, extract: ExtractConfig, gridding: Gridding) ->
     assert seen is not None
     agents = pc.unique(truth["agent_id"]).to_pylist()
     step_ns = _step_ns(path, truth.filter(pc.equal(truth["agent_id"], agents[0])), mission, gridding)
+    tracks = [_of_agent(truth, agent) for agent in agents]
     parts = [
-        _episode(path, _of_agent(truth, agent), _seen_of(seen.slice(0, 0) if is_unseen else seen, agent, len(agents), path),
+        _episode(path, track, _seen_of(seen.slice(0, 0) if is_unseen else seen, agent, len(agents), path),
                  tables["poses"], step_ns, mission, gridding)
-        for agent in agents
+        for agent, track in zip(agents, tracks, strict=True)
     ]  # fmt: skip
     names = (path.stem,) if len(agents) == 1 else tuple(f"{path.stem}/{agent}" for agent in agents)
     recordings = Recordings.concatenate(parts)
-    starts = {_of_agent(truth, agent)[0][0] for agent in agents}
-    if len(starts) == 1 == len(set(recordings.length)):
+    if len({time_ns[0] for time_ns, _ in tracks}) == len(set(recordings.length)) == 1:
         recordings = replace(recordings, num_agents=len(agents))
     return LogEpisodes(recordings, names, _scale_m(mission), json.dumps(entries, sort_keys=True))
 

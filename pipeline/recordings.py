@@ -32,6 +32,9 @@ BLOCK = 500
 FORMAT = 1
 """Of the files in the cache."""
 
+_READING = 2
+"""Of what is read of a log: since 2 its targets may be one episode."""
+
 
 @dataclass(frozen=True)
 class RecordingsConfig:
@@ -201,7 +204,7 @@ def _check_together(log: Path, episodes: LogEpisodes, before: Sequence[LogEpisod
 def _of_log(log: Path, config: RecordingsConfig, cache: Path) -> LogEpisodes:
     """The episodes of one log, from the cache where it has them."""
     gridding = Gridding(config.step_s, config.max_gap_steps, config.tolerance_m)
-    key = [hash_file(log), config_as_dict(config.extract), config_as_dict(gridding)]
+    key = [hash_file(log), config_as_dict(config.extract), config_as_dict(gridding), _READING]
     path = cache / "logs" / f"{_digest(key)}.npz"
     if path.is_file():
         recordings, more = read_recordings(path)

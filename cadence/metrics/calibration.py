@@ -17,7 +17,6 @@ from torch import Tensor
 
 _MAX_PAIRS = 8_000_000
 
-
 _SAME_PLACE_M = 1e-3
 """Points so near to the truth are tied with it: hypotheses that all pass through an exact detection are stored in float32."""
 
