@@ -304,8 +304,8 @@ stream by a particle filter, the detections that a way gives to an agent smoothe
 all, and the mean of {num_ways} ways as sets (matched at every moment to the first). *GNN* and *JPDA* are Stone Soup's trackers
 (constant velocity) with its Rauch-Tung-Striebel smoother; noise, gate and patience are searched by GOSPA on four other episodes
 (ships: on the first quarter of the log, which is not scored), one after the other, each as far as it gets better. *True
-origins* is the bank given the truth's labels: what is left is not association. The rule for the way that stands first was settled
-with these 20 episodes in view; nothing else of ours was.
+origins* is the bank given the truth's labels: what is left is not association. The rule for the way that stands first was
+settled with these 20 episodes in view; nothing else of ours was.
 
 GOSPA with order p = 2 and alpha = 2, mean over time, metres; its parts as root mean square, metres; OSPA with the same order
 and cut-off. Labels: those that are right, names matched one to one once a log. Links: two successive detections of a target

@@ -29,7 +29,7 @@ from cadence.diffusion.absolute import AbsoluteSampling
 from cadence.diffusion.scene import SceneSampling
 from cadence.errors import CadenceError, InputError
 from cadence.worlds.recordings import Recordings
-from pipeline.checkpoints import checkpoint_hash, find_checkpoint, read_info
+from pipeline.checkpoints import checkpoint_hash, find_checkpoint, read_info, windows_seen
 from pipeline.config import config_as_dict
 from pipeline.forecast_leads import averaged, count, relative_lead, verdicts
 from pipeline.forecast_scores import HORIZONS, MEASURES, SHARES, EpisodeScores
@@ -240,11 +240,9 @@ def candidates(name: str, case: Case, seed: int) -> list[str]:
 
 def budget(training: Mapping[str, Any]) -> dict[str, Any]:
     """Steps, windows seen and processor time of a training, as far as its checkpoint says."""
-    config = training.get("config") or {}
-    steps, batch = training.get("steps"), config.get("batch_size")
-    windows = training.get("windows", steps * batch if steps and batch else None)
     seconds = next((training[key] for key in ("cpu_seconds", "cpu_s", "seconds") if key in training), None)
-    return {"steps": steps, "windows": windows, "cpu_hours": None if seconds is None else seconds / 3600.0}
+    hours = None if seconds is None else seconds / 3600.0
+    return {"steps": training.get("steps"), "windows": windows_seen(training), "cpu_hours": hours}
 
 
 @dataclass(frozen=True)

@@ -104,6 +104,13 @@ def load_weights(path: Path, network: nn.Module) -> None:
     network.load_state_dict(tensors)
 
 
+def windows_seen(training: Mapping[str, Any]) -> int | None:
+    """Training windows behind a checkpoint, by what it says of its training; None where that says too little."""
+    steps, batch = training.get("steps"), (training.get("config") or {}).get("batch_size")
+    windows: int | None = training.get("windows", steps * batch if steps and batch else None)
+    return windows
+
+
 def checkpoint_hash(path: Path) -> str:
     """Hash of weights and JSON together, for manifests."""
     return hash_file(path)[:16] + hash_file(path.with_suffix(".json"))[:16]

@@ -149,7 +149,7 @@ def train_absolute(out: Path, config: "TrainConfig", progress: Progress, force: 
         parts = [windows[begin : begin + 256] for begin in range(0, len(windows), 256)]
         return sum(float(_loss(network, part, generator)) * len(part) for part in parts) / len(windows)
 
-    run = TrainingRun(out, "paper", config, source.model, config.optimiser.num_steps, config.validate_every, config.save_every)
+    run = TrainingRun(out, "paper", config, source.model, config.optimiser.num_steps)
     return run_training(run, trainer, loss_at, validate, progress, force)
 
 

@@ -50,9 +50,7 @@ def train_general(out: Path, config: "TrainConfig", progress: Progress, force: b
         parts = [torch.arange(begin, min(begin + 256, len(windows))) for begin in range(0, len(windows), 256)]
         return sum(float(residual_loss(network, windows[part], generator)) * len(part) for part in parts) / len(windows)
 
-    run = TrainingRun(
-        out, "general", config, config.network, config.optimiser.num_steps, config.validate_every, config.save_every
-    )
+    run = TrainingRun(out, "general", config, config.network, config.optimiser.num_steps)
     return run_training(run, trainer, loss_at, validate, progress, force)
 
 

@@ -70,7 +70,8 @@ class RivalTraining:
     kl_weight      of the divergence in the VRNN's loss
     mi_weight      of the cross-entropy in GrAMMI's loss
     tuning_steps, tuning_rate  of GrAMMI with mutual information, which goes on from the model without
-    start          that model's checkpoint; without one it is trained first, in the folder without_mi
+    start          checkpoint of a GrAMMI without mutual information to go on from, whose one trunk may become one for each
+                   horizon; GrAMMI with it trains one first, in the folder without_mi, unless this is given
     """
 
     vrnn: VrnnNetworkConfig = field(default_factory=VrnnNetworkConfig)
@@ -172,7 +173,7 @@ def _train(
         windows = hidden_goals(source.batch(step), rival.hidden_goals, generator)
         return functools.partial(_loss, windows=windows, rival=rival, generator=generator)
 
-    run = TrainingRun(out, config.preset, config, description, optimiser.num_steps, config.validate_every, config.save_every)
+    run = TrainingRun(out, config.preset, config, description, optimiser.num_steps, rival.start)
     best = _Best(out, run.key, force)
 
     @torch.no_grad()
@@ -182,7 +183,7 @@ def _train(
         return score
 
     result = run_training(run, trainer, loss_at, validate, progress, force)
-    return best.ship(result, trainer.ema.network, config.batch_size)
+    return best.ship(result, trainer.ema.network)
 
 
 def _fresh(description: VrnnConfig | GrammiConfig) -> VrnnNetwork | GrammiNetwork:
@@ -192,16 +193,27 @@ def _fresh(description: VrnnConfig | GrammiConfig) -> VrnnNetwork | GrammiNetwor
 
 
 def _network(description: VrnnConfig | GrammiConfig, start: Path | None) -> VrnnNetwork | GrammiNetwork:
-    """A fresh network, or with mutual information one that begins with the weights of `start`."""
+    """A fresh network, or a GrAMMI that begins with the weights of `start`."""
     network = _fresh(description)
-    if isinstance(description, GrammiConfig) and description.network.mutual_information and start is not None:
-        before: GrammiConfig = network_config(GrammiConfig, read_info(start), start)
-        without = dataclasses.replace(description, network=dataclasses.replace(description.network, mutual_information=False))
-        if before != without:
-            raise ConfigError(f"{start}: not the same network or map without mutual information; set train.rival alike")
-        trained = GrammiNetwork(before.network)
-        load_weights(start, trained)
-        network.load_state_dict(trained.state_dict(), strict=False)
+    if start is None:
+        return network
+    if not isinstance(description, GrammiConfig):
+        raise ConfigError("train.rival.start: the VRNN begins anew; take start out")
+    before: GrammiConfig = network_config(GrammiConfig, read_info(start), start)
+    splits = before.network.shared_trunk and not description.network.shared_trunk
+    widened = dataclasses.replace(before.network, shared_trunk=before.network.shared_trunk and not splits)
+    without = dataclasses.replace(description, network=dataclasses.replace(description.network, mutual_information=False))
+    if dataclasses.replace(before, network=widened) != without:
+        raise ConfigError(f"{start}: not the same network or map without mutual information; set train.rival alike")
+    trained = GrammiNetwork(before.network)
+    load_weights(start, trained)
+    copies = range(len(description.network.horizons)) if splits else range(1)
+    weights = {
+        name.replace("trunks.0.", f"trunks.{index}.", 1): value
+        for name, value in trained.state_dict().items()
+        for index in copies
+    }
+    network.load_state_dict(weights, strict=False)
     return network
 
 
@@ -286,13 +298,13 @@ class _Best:
             save_file({name: value.contiguous() for name, value in network.state_dict().items()}, self.weights)
             write_atomic(self.note, json.dumps({"key": self.key, "step": step, "loss": loss}) + "\n")
 
-    def ship(self, result: StageResult, network: nn.Module, batch_size: int) -> StageResult:
+    def ship(self, result: StageResult, network: nn.Module) -> StageResult:
         """Put the best weights into the checkpoint, in place of the last ones."""
         checkpoint = Path(result.outputs[0])
         info: CheckpointInfo = read_info(checkpoint)
         if self.step >= 0:
             network.load_state_dict(load_file(self.weights))
-        training = {**info.training, "best_step": self.step, "windows": result.summary["steps"] * batch_size}
+        training = {**info.training, "best_step": self.step}
         save_checkpoint(
             checkpoint, network, dataclasses.replace(info, training=training, scores={"validation_loss": self.loss})
         )

@@ -121,8 +121,8 @@ def train_scene_network(
         total = sum(float(_loss(network, part, scene, model, generator)) * len(part) for part in parts)
         return total / len(validation)
 
-    steps = config.optimiser.num_steps
-    run = TrainingRun(out, "scene", config, model, steps, config.validate_every, config.save_every)
+    start = None if scene.start is None else find_checkpoint(scene.start)
+    run = TrainingRun(out, "scene", config, model, config.optimiser.num_steps, start)
     return run_training(run, Trainer(network, config.optimiser), loss_at, validate, progress, force)
 
 

@@ -7,7 +7,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
@@ -15,10 +15,13 @@ from torch import nn
 
 from cadence.errors import InputError
 from cadence.training.loop import Loss, Trainer
-from pipeline.checkpoints import CheckpointInfo, save_checkpoint
+from pipeline.checkpoints import CheckpointInfo, read_info, save_checkpoint, windows_seen
 from pipeline.config import config_as_dict
 from pipeline.manifest import StageResult, write_atomic
 from pipeline.progress import Progress
+
+if TYPE_CHECKING:
+    from pipeline.train import TrainConfig
 
 Curve = list[tuple[int, float, float]]
 """(step, training loss, validation loss) of every validation."""
@@ -34,16 +37,15 @@ class TrainingRun:
     config     the whole configuration: a state of another one is not taken up
     network    the configuration that the checkpoint needs to be read again
     num_steps  optimiser steps
-    validate_every, save_every  steps
+    start      checkpoint that the training began with, whose windows count too
     """
 
     out: Path
     preset: str
-    config: object
+    config: "TrainConfig"
     network: object
     num_steps: int
-    validate_every: int
-    save_every: int
+    start: Path | None = None
 
     @property
     def key(self) -> str:
@@ -79,11 +81,11 @@ def run_training(
             recent.append(trainer.advance(loss_at(trainer.step)))
             bar.update(1)
             is_last = trainer.step == run.num_steps
-            if trainer.step % run.validate_every == 0 or is_last:
+            if trainer.step % run.config.validate_every == 0 or is_last:
                 curve.append((trainer.step, sum(recent) / len(recent), validate(trainer.ema.network)))
                 recent = []
                 bar.set_postfix_str(f"loss {curve[-1][1]:.4f}, validation {curve[-1][2]:.4f}")
-            if trainer.step % run.save_every == 0 or is_last:
+            if trainer.step % run.config.save_every == 0 or is_last:
                 _save(run, trainer, curve)
     _draw_curve(run.out, curve)
     summary: dict[str, Any] = {"steps": trainer.step, "checkpoint": str(run.out / OUTPUTS[0])}
@@ -112,10 +114,20 @@ def _save(run: TrainingRun, trainer: Trainer, curve: Curve) -> None:
     save_file(trainer.state(), partial)
     write_atomic(run.out / "state.key", run.key)
     os.replace(partial, run.out / "state.safetensors")
-    training = {"command": "cadence " + " ".join(sys.argv[1:]), "config": config_as_dict(run.config), "steps": trainer.step}
+    training = {
+        "command": "cadence " + " ".join(sys.argv[1:]),
+        "config": config_as_dict(run.config),
+        "steps": trainer.step,
+        "windows": trainer.step * run.config.batch_size + _windows_before(run.start),
+    }
     scores = {"validation_loss": curve[-1][2]} if curve else {}
     info = CheckpointInfo(run.preset, config_as_dict(run.network), training, scores)
     save_checkpoint(run.out / OUTPUTS[0], trainer.ema.network, info)
+
+
+def _windows_before(start: Path | None) -> int:
+    """Windows that the checkpoint has seen that a training began with, itself and those before it."""
+    return 0 if start is None else int(windows_seen(read_info(start).training) or 0)
 
 
 def _draw_curve(out: Path, curve: Curve) -> None:

@@ -136,6 +136,27 @@ def test_grammi_goes_on_from_the_model_without_mutual_information(tmp_path):
     assert 0 < distance < 50, "fine-tuning by three small steps must change the answer, and not much"
 
 
+def test_one_trunk_becomes_one_for_each_horizon(tmp_path):
+    """A step too small to matter shows what a training begins with: the same answers, from more weights."""
+    parts = recordings(), recordings(1)
+    first = train_rival(tmp_path / "first", config("grammi_without_mi"), *parts, QUIET).outputs[0]
+    apart = dataclasses.replace(RIVAL, start=first, grammi=dataclasses.replace(RIVAL.grammi, shared_trunk=False))
+    still = dataclasses.replace(config("grammi_without_mi", rival=apart), optimiser=OptimiserConfig(1e-9, 1, 1))
+    widened = train_rival(tmp_path / "apart", still, *parts, QUIET).outputs[0]
+    network, shared = load_rival(widened).network, load_rival(first).network
+    assert len(network.trunks) == len(network.horizons) > len(shared.trunks) == 1
+    rec = recordings(2)
+    found = cut_windows(rec, *choose_windows(rec, 8, np.random.default_rng(0)), num_tracker_steps=4)
+    a, b = (load_rival(path).placed(found.context).mixture(found.windows) for path in (widened, first))
+    torch.testing.assert_close(a.mean_m, b.mean_m)
+    assert (read_info(first).training["windows"], read_info(widened).training["windows"]) == (6 * 16, 7 * 16)
+    with pytest.raises(ConfigError, match="not the same network"):  # trunks apart do not become one again
+        back = dataclasses.replace(RIVAL, start=widened)
+        train_rival(tmp_path / "back", config("grammi_without_mi", rival=back), *parts, QUIET)
+    with pytest.raises(ConfigError, match="VRNN begins anew"):
+        train_rival(tmp_path / "vrnn", config("vrnn", rival=dataclasses.replace(RIVAL, start=first)), *parts, QUIET)
+
+
 def test_presets_by_configuration_with_sources(tmp_path):
     save_recordings(tmp_path / "walks.npz", recordings(num_episodes=10))
     sources = (RecordingsConfig(data=tmp_path / "walks.npz"),)
