@@ -6,6 +6,7 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
+from killed_training import Killed, Killer
 
 from cadence.diffusion.absolute import AbsoluteConfig, AbsoluteSampling
 from cadence.errors import ConfigError, InputError
@@ -90,8 +91,8 @@ def test_relative_windows_forget_where_they_are(episode):
 def test_a_killed_training_goes_on_and_ends_as_an_unbroken_one(tmp_path):
     whole = train(tmp_path / "whole", config(), QUIET)
 
-    with pytest.raises(KeyboardInterrupt):
-        train(tmp_path / "broken", config(), _Stopping(quiet=True))
+    with pytest.raises(Killed):
+        train(tmp_path / "broken", config(), Killer())
     again = train(tmp_path / "broken", config(), QUIET)
     assert again.summary["steps"] == 4
     for name in ("checkpoint.safetensors", "curve.csv"):
@@ -170,8 +171,8 @@ def of_episodes(tmp_path):
 
 def test_training_from_episodes_goes_on_where_it_was_and_forecasts(of_episodes, tmp_path):
     whole = train(tmp_path / "whole", of_episodes, QUIET)
-    with pytest.raises(KeyboardInterrupt):
-        train(tmp_path / "killed", of_episodes, _Stopping())
+    with pytest.raises(Killed):
+        train(tmp_path / "killed", of_episodes, Killer())
     train(tmp_path / "killed", of_episodes, QUIET)
     for name in ("checkpoint.safetensors", "curve.csv"):
         assert (tmp_path / "killed" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
@@ -205,32 +206,6 @@ def test_episodes_that_do_not_fit(of_episodes, tmp_path):
             dataclasses.replace(of_episodes.paper, **changes)
     with pytest.raises(ValueError, match="sources"):
         AbsoluteTraining(validation=of_episodes.paper.sources)
-
-
-class _Stopping(Progress):
-    """Interrupts at the third step."""
-
-    def bar(self, total, label, unit="it", scale=False):
-        return _Bar()
-
-
-class _Bar:
-    def __init__(self):
-        self.count = 0
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *_):
-        return None
-
-    def update(self, count):
-        self.count += count
-        if self.count == 3:
-            raise KeyboardInterrupt
-
-    def set_postfix_str(self, text):
-        del text
 
 
 def test_training_from_logs(tmp_path):

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 import torch
+from killed_training import Killed
 from safetensors.torch import load_file
 
 from cadence.errors import InputError
@@ -31,10 +32,6 @@ CONFIG = TrainConfig(
     batch_size=8, num_shards=2, validate_every=2, save_every=2, network=NETWORK, windows=WINDOWS, optimiser=OPTIMISER
 )
 OUTPUTS = ["checkpoint.json", "checkpoint.safetensors", "curve.csv", "curve.png"]
-
-
-class Killed(Exception):
-    """What a kill looks like from inside."""
 
 
 @pytest.fixture(autouse=True)

@@ -6,6 +6,7 @@ import json
 import numpy as np
 import pytest
 import torch
+from killed_training import Killed, Killer
 
 from cadence.baselines.grammi import GrammiNetworkConfig
 from cadence.baselines.mixture import HistoryConfig
@@ -50,42 +51,12 @@ def recordings(seed=0, num_episodes=4, length=60):
     )
 
 
-class Killed(Exception):
-    pass
-
-
-class Killer(Progress):
-    """Ends a training by an exception after some steps."""
-
-    steps = 5
-
-    def bar(self, total, label, unit="it", scale=False):
-        class Bar:
-            count = 0
-
-            def __enter__(self):
-                return self
-
-            def __exit__(self, *args):
-                return None
-
-            def update(self, n):
-                self.count += n
-                if self.count == Killer.steps:
-                    raise Killed
-
-            def set_postfix_str(self, text):
-                pass
-
-        return Bar()
-
-
 @pytest.mark.parametrize("preset", ["vrnn", "grammi_without_mi"])
 def test_a_killed_training_goes_on_and_ends_as_an_unbroken_one(preset, tmp_path):
     parts = recordings(), recordings(1)
     train_rival(tmp_path / "whole", config(preset), *parts, QUIET)
     with pytest.raises(Killed):
-        train_rival(tmp_path / "broken", config(preset), *parts, Killer(quiet=True))
+        train_rival(tmp_path / "broken", config(preset), *parts, Killer(5))
     again = train_rival(tmp_path / "broken", config(preset), *parts, QUIET)
     assert again.summary["steps"] == 6
     for name in ("checkpoint.safetensors", "checkpoint.json", "curve.csv", "best.json"):

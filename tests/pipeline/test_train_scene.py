@@ -8,6 +8,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 import torch
+from killed_training import Killed, Killer
 
 from cadence.diffusion.scene import SceneSampling
 from cadence.diffusion.scene_frame import SceneConfig
@@ -67,8 +68,8 @@ def config(sources, num_steps=4, **changes):
 
 def test_a_killed_training_goes_on_to_the_same_weights(sources, tmp_path):
     whole = train(tmp_path / "whole", config(sources), QUIET)
-    with pytest.raises(KeyboardInterrupt):
-        train(tmp_path / "killed", config(sources), _Stopping())
+    with pytest.raises(Killed):
+        train(tmp_path / "killed", config(sources), Killer())
     assert (tmp_path / "killed" / "state.safetensors").is_file()
     again = train(tmp_path / "killed", config(sources), QUIET)
     first, second = (load_scene(result.outputs[0]).network.state_dict() for result in (whole, again))
@@ -173,29 +174,3 @@ def mission_directory(tmp_path):
     write_table(table, folder / "detections.parquet", "detections", Frame("map", None, None))
     (folder / "obstacles.json").write_text(json.dumps({"version": 1, "obstacles": []}))
     return folder
-
-
-class _Bar:
-    """A bar that is interrupted at the third step."""
-
-    def __init__(self):
-        self.count = 0
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *_):
-        return None
-
-    def update(self, count):
-        self.count += count
-        if self.count == 3:
-            raise KeyboardInterrupt
-
-    def set_postfix_str(self, text):
-        del text
-
-
-class _Stopping(Progress):
-    def bar(self, total, label, unit="it", scale=False):
-        return _Bar()
