@@ -1,5 +1,6 @@
 """Training of the learned rivals: VRNN and GrAMMI without and with mutual information, on windows cut out of recordings."""
 
+import copy
 import dataclasses
 import functools
 import json
@@ -70,8 +71,8 @@ class RivalTraining:
     kl_weight      of the divergence in the VRNN's loss
     mi_weight      of the cross-entropy in GrAMMI's loss
     tuning_steps, tuning_rate  of GrAMMI with mutual information, which goes on from the model without
-    start          checkpoint of a GrAMMI without mutual information to go on from, whose one trunk may become one for each
-                   horizon; GrAMMI with it trains one first, in the folder without_mi, unless this is given
+    start          checkpoint to go on from; a GrAMMI may grow a posterior, and its one trunk may become one for each horizon.
+                   GrAMMI with mutual information needs one without, and trains it in the folder without_mi where none is given
     """
 
     vrnn: VrnnNetworkConfig = field(default_factory=VrnnNetworkConfig)
@@ -142,14 +143,19 @@ def train_rival(
 
 def load_rival(weights: Path, uses_goal: bool = False) -> MixtureModel:
     """The estimator of a rival's checkpoint; `ConfigError` where it is of another preset or does not fit."""
+    config = _description(weights)
+    network = _fresh(config)
+    load_weights(weights, network)
+    return MixtureModel(network.eval(), config.frame, read_info(weights).preset, uses_goal)
+
+
+def _description(weights: Path) -> VrnnConfig | GrammiConfig:
+    """What the checkpoint says of its network."""
     info = read_info(weights)
     if info.preset not in RIVALS:
         raise ConfigError(f"{weights}: a checkpoint of the preset {info.preset!r}, expected one of {', '.join(RIVALS)}")
-    kind = VrnnConfig if info.preset == "vrnn" else GrammiConfig
-    config: VrnnConfig | GrammiConfig = network_config(kind, info, weights)
-    network = _fresh(config)
-    load_weights(weights, network)
-    return MixtureModel(network.eval(), config.frame, info.preset, uses_goal)
+    found: VrnnConfig | GrammiConfig = network_config(VrnnConfig if info.preset == "vrnn" else GrammiConfig, info, weights)
+    return found
 
 
 def _train(
@@ -193,28 +199,32 @@ def _fresh(description: VrnnConfig | GrammiConfig) -> VrnnNetwork | GrammiNetwor
 
 
 def _network(description: VrnnConfig | GrammiConfig, start: Path | None) -> VrnnNetwork | GrammiNetwork:
-    """A fresh network, or a GrAMMI that begins with the weights of `start`."""
+    """A fresh network, or one that begins with the weights of `start`."""
     network = _fresh(description)
     if start is None:
         return network
-    if not isinstance(description, GrammiConfig):
-        raise ConfigError("train.rival.start: the VRNN begins anew; take start out")
-    before: GrammiConfig = network_config(GrammiConfig, read_info(start), start)
-    splits = before.network.shared_trunk and not description.network.shared_trunk
-    widened = dataclasses.replace(before.network, shared_trunk=before.network.shared_trunk and not splits)
-    without = dataclasses.replace(description, network=dataclasses.replace(description.network, mutual_information=False))
-    if dataclasses.replace(before, network=widened) != without:
-        raise ConfigError(f"{start}: not the same network or map without mutual information; set train.rival alike")
-    trained = GrammiNetwork(before.network)
+    before = _description(start)
+    if not _grows_into(before, description):
+        raise ConfigError(f"{start}: not the same network or map; set train.rival alike")
+    trained = _fresh(before)
     load_weights(start, trained)
-    copies = range(len(description.network.horizons)) if splits else range(1)
-    weights = {
-        name.replace("trunks.0.", f"trunks.{index}.", 1): value
-        for name, value in trained.state_dict().items()
-        for index in copies
-    }
-    network.load_state_dict(weights, strict=False)
+    if isinstance(network, GrammiNetwork) and isinstance(trained, GrammiNetwork):
+        trained.trunks.extend(copy.deepcopy(trained.trunks[0]) for _ in network.trunks[len(trained.trunks) :])
+    network.load_state_dict(trained.state_dict(), strict=False)
     return network
+
+
+def _grows_into(before: VrnnConfig | GrammiConfig, description: VrnnConfig | GrammiConfig) -> bool:
+    """Whether the networks are alike, but for a posterior that comes in, or one trunk that becomes one for each horizon."""
+    if isinstance(before, GrammiConfig) and isinstance(description, GrammiConfig):
+        old, new = before.network, description.network
+        grown = dataclasses.replace(
+            old,
+            mutual_information=old.mutual_information or new.mutual_information,
+            shared_trunk=old.shared_trunk and new.shared_trunk,
+        )
+        before = dataclasses.replace(before, network=grown)
+    return before == description
 
 
 def _loss(network: nn.Module, windows: MixtureWindows, rival: RivalTraining, generator: torch.Generator) -> Tensor:

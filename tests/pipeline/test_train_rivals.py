@@ -124,8 +124,20 @@ def test_one_trunk_becomes_one_for_each_horizon(tmp_path):
     with pytest.raises(ConfigError, match="not the same network"):  # trunks apart do not become one again
         back = dataclasses.replace(RIVAL, start=widened)
         train_rival(tmp_path / "back", config("grammi_without_mi", rival=back), *parts, QUIET)
-    with pytest.raises(ConfigError, match="VRNN begins anew"):
+    with pytest.raises(ConfigError, match="not the same network"):
         train_rival(tmp_path / "vrnn", config("vrnn", rival=dataclasses.replace(RIVAL, start=first)), *parts, QUIET)
+
+
+def test_a_vrnn_goes_on_from_another_training(tmp_path):
+    parts = recordings(), recordings(1)
+    first = train_rival(tmp_path / "first", config("vrnn"), *parts, QUIET).outputs[0]
+    going_on = dataclasses.replace(
+        config("vrnn", rival=dataclasses.replace(RIVAL, start=first)), optimiser=OptimiserConfig(1e-9, 1, 1)
+    )
+    second = train_rival(tmp_path / "second", going_on, *parts, QUIET).outputs[0]
+    for a, b in zip(*(load_rival(path).network.parameters() for path in (first, second)), strict=True):
+        torch.testing.assert_close(a, b)
+    assert read_info(second).training["windows"] == 7 * 16
 
 
 def test_presets_by_configuration_with_sources(tmp_path):
