@@ -8,8 +8,8 @@ import contextlib
 import hashlib
 import json
 import os
+import secrets
 import shutil
-import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -125,16 +125,20 @@ def _still_valid(stage: str, directory: Path, earlier: JsonObject, key: JsonObje
 @contextlib.contextmanager
 def _working_folder(stage: str, directory: Path) -> Iterator[Path]:
     is_new = not directory.exists()
-    try:
-        directory.mkdir(parents=True, exist_ok=True)
-        work = Path(tempfile.mkdtemp(prefix=f".{stage}.", dir=directory))
-    except OSError as error:
-        raise DeviceError(f"{directory}: cannot write there ({error.strerror}); choose another folder with --out") from error
-    try:
-        with locked(work):  # so that others know it from what a killed process left
-            yield work
-    except OSError as error:
-        raise DeviceError(f"{directory}: {stage} could not write its output ({error}); check the free space") from error
+    work = directory / f".{stage}.{secrets.token_hex(4)}"
+    try:  # begins before the folder is there, as a signal may end it at any moment
+        try:
+            directory.mkdir(parents=True, exist_ok=True)
+            work.mkdir(mode=0o700)
+        except OSError as error:
+            raise DeviceError(
+                f"{directory}: cannot write there ({error.strerror}); choose another folder with --out"
+            ) from error
+        try:
+            with locked(work):  # so that others know it from what a killed process left
+                yield work
+        except OSError as error:
+            raise DeviceError(f"{directory}: {stage} could not write its output ({error}); check the free space") from error
     finally:
         shutil.rmtree(work, ignore_errors=True)
         if is_new:
