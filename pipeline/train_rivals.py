@@ -143,15 +143,15 @@ def train_rival(
 
 def load_rival(weights: Path, uses_goal: bool = False) -> MixtureModel:
     """The estimator of a rival's checkpoint; `ConfigError` where it is of another preset or does not fit."""
-    config = _description(weights)
+    info = read_info(weights)
+    config = _description(info, weights)
     network = _fresh(config)
     load_weights(weights, network)
-    return MixtureModel(network.eval(), config.frame, read_info(weights).preset, uses_goal)
+    return MixtureModel(network.eval(), config.frame, info.preset, uses_goal)
 
 
-def _description(weights: Path) -> VrnnConfig | GrammiConfig:
+def _description(info: CheckpointInfo, weights: Path) -> VrnnConfig | GrammiConfig:
     """What the checkpoint says of its network."""
-    info = read_info(weights)
     if info.preset not in RIVALS:
         raise ConfigError(f"{weights}: a checkpoint of the preset {info.preset!r}, expected one of {', '.join(RIVALS)}")
     found: VrnnConfig | GrammiConfig = network_config(VrnnConfig if info.preset == "vrnn" else GrammiConfig, info, weights)
@@ -203,7 +203,7 @@ def _network(description: VrnnConfig | GrammiConfig, start: Path | None) -> Vrnn
     network = _fresh(description)
     if start is None:
         return network
-    before = _description(start)
+    before = _description(read_info(start), start)
     if not _grows_into(before, description):
         raise ConfigError(f"{start}: not the same network or map; set train.rival alike")
     trained = _fresh(before)
