@@ -325,8 +325,8 @@ def _draw_part(
     model: GeneralModel, batch: WindowBatch, datum_m: Tensor, config: InferConfig, obstacles: Obstacles
 ) -> tuple[Tensor, Tensor, list[list[str]]]:
     active = batch.is_active
-    limits = Feasibility(obstacles, config.guidance.margin_m, config.guidance.max_speed_mps, batch.step_s, torch.zeros(0))
-    limits = limits.for_rows(datum_m[active.nonzero()[:, 0]])
+    offset_m = datum_m[active.nonzero()[:, 0], None, None]
+    limits = Feasibility(obstacles, config.guidance.margin_m, config.guidance.max_speed_mps, batch.step_s, offset_m)
     is_limited = obstacles.count > 0 or config.guidance.max_speed_mps is not None
     guided = dataclasses.replace(model, guide=limits.guide if is_limited and config.guidance.mode == "clean" else None)
     drawn = guided.sample(batch, config.num_hypotheses)

@@ -9,6 +9,7 @@ import torch
 from cadence.network.residual import ResidualNetworkConfig
 from cadence.training.loop import OptimiserConfig
 from cadence.training.synthetic import SyntheticConfig
+from pipeline.extract import ExtractConfig
 from pipeline.manifest import StageResult
 from pipeline.progress import Progress
 from pipeline.train_absolute import AbsoluteTraining, train_absolute
@@ -25,6 +26,7 @@ class TrainConfig:
                       place learned by heart), or one of the paper's rivals: "vrnn", "grammi_without_mi", "grammi" (which
                       trains the one without first)
     data              folder of MCAP logs with truth; None = synthetic kinematics (general) or the simulator (paper)
+    extract           where truth and detections are in the logs of `data`
     seed              of weights, data and noise
     batch_size        windows a step
     num_shards        synthetic shards of about 1250 windows; a shard is made when it is first needed
@@ -39,6 +41,7 @@ class TrainConfig:
 
     preset: Literal["general", "paper", "scene", "vrnn", "grammi_without_mi", "grammi"] = "general"
     data: Path | None = None
+    extract: ExtractConfig = field(default_factory=ExtractConfig)
     seed: int = 0
     batch_size: int = 128
     num_shards: int = 48

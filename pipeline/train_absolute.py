@@ -20,7 +20,6 @@ from cadence.training.absolute import AbsoluteWindows, absolute_loss, forecast_r
 from cadence.training.loop import Loss, Trainer
 from cadence.worlds.patrol import PatrolConfig, simulate_patrol
 from cadence.worlds.recordings import NUM_STEPS, Int64s, Recordings, cut_windows
-from pipeline.extract import ExtractConfig
 from pipeline.manifest import StageResult
 from pipeline.progress import Progress
 from pipeline.training_episodes import EpisodeSource, load_pool
@@ -60,7 +59,6 @@ class AbsoluteTraining:
     validation_share  of the logs, whole ones; at least one
     num_episodes, num_validation_episodes  of the simulator
     patrol         the simulator's settings
-    extract        where truth and detections are in the logs
     sources        episodes of one target to train on, in place of logs and patrol: any number of windows, as in the paper
                    with the first position as a detection and the target parked after the end
     validation     episodes to validate on; without them the last ones of each source (validation_share)
@@ -84,7 +82,6 @@ class AbsoluteTraining:
     num_episodes: int = 400
     num_validation_episodes: int = 16
     patrol: PatrolConfig = field(default_factory=_patrol)
-    extract: ExtractConfig = field(default_factory=ExtractConfig)
     sources: tuple[EpisodeSource, ...] = ()
     validation: tuple[EpisodeSource, ...] = ()
     num_validation_windows: int = 1000
@@ -213,7 +210,7 @@ class _LogSource:
     def __init__(self, out: Path, config: "TrainConfig", progress: Progress) -> None:
         assert config.data is not None
         paper = config.paper
-        missions = missions_of_logs(config.data, out / "logs", paper.extract, progress)
+        missions = missions_of_logs(config.data, out / "logs", config.extract, progress)
         if len(missions) < 2:
             raise InputError(f"{config.data}: one usable log; at least two are needed, as whole logs are kept for validation")
         order = np.random.default_rng([config.seed, 1]).permutation(len(missions))

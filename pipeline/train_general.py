@@ -88,7 +88,7 @@ class _LogSource:
 
     def __init__(self, out: Path, config: "TrainConfig", progress: Progress) -> None:
         assert config.data is not None
-        missions = missions_of_logs(config.data, out / "logs", config.paper.extract, progress)
+        missions = missions_of_logs(config.data, out / "logs", config.extract, progress)
         if len(missions) < 2:
             raise InputError(f"{config.data}: one usable log; at least two are needed, as whole logs are kept for validation")
         order = np.random.default_rng([config.seed, 1]).permutation(len(missions)).tolist()

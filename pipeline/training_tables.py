@@ -46,14 +46,14 @@ def missions_of_logs(data: Path, cache: Path, config: ExtractConfig, progress: P
                 progress.note(f"train: left out: {error}")
             bar.update(1)
     if not missions:
-        raise InputError(f"{data}: no log in it has detections and truth; map them in [train.paper.extract]")
+        raise InputError(f"{data}: no log in it has detections and truth; map them in [train.extract]")
     return missions
 
 
 def _read_mission(log: Path, directory: Path) -> TrainingMission:
     detections, _ = read_table(directory / "detections.parquet", "detections")
     if not (directory / "truth.parquet").is_file():
-        raise InputError(f"{log}: has no truth; name its topic with [[train.paper.extract.truth]]")
+        raise InputError(f"{log}: has no truth; name its topic with [[train.extract.truth]]")
     truth, _ = read_table(directory / "truth.parquet", "truth")
     return TrainingMission(log.stem, detections, truth)
 

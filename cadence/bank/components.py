@@ -10,7 +10,6 @@ Everything is closed form, so that detections may lie at any times.
 """
 
 import itertools
-import math
 from dataclasses import dataclass
 from types import EllipsisType
 
@@ -160,8 +159,3 @@ def _noise(
         diffusion * torch.where(is_small, pv_small, pv_closed),
         diffusion * torch.where(is_small, vv_small, vv_closed),
     )
-
-
-def stationary_speed(models: MotionModels) -> Tensor:
-    """Root mean square speed (both axes) of each model in its initial law [C]."""
-    return models.initial_speed * math.sqrt(2.0)

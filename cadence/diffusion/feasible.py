@@ -1,6 +1,5 @@
 """Constraints on hypotheses: guidance of clean estimates while sampling, repair and weights at the end."""
 
-import dataclasses
 from dataclasses import dataclass
 
 import torch
@@ -63,10 +62,6 @@ class Feasibility:
             _LEAST_WEIGHT
         )
         return moved, weight / weight.sum(1, keepdim=True), is_feasible
-
-    def for_rows(self, offset_m: Tensor) -> "Feasibility":
-        """The same for rows with other datums [R, 2]."""
-        return dataclasses.replace(self, offset_m=offset_m[:, None, None])
 
 
 def resampled(position_m: Tensor, weight: Tensor, seeds: Tensor) -> Tensor:

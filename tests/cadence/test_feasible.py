@@ -44,7 +44,7 @@ def in_the_way() -> Obstacles:
 
 
 OBSTACLES = in_the_way()
-LIMITS = Feasibility(OBSTACLES, 0.0, None, 1.0, torch.zeros(0)).for_rows(DATUM)
+LIMITS = Feasibility(OBSTACLES, 0.0, None, 1.0, DATUM[:, None, None])
 NO_LIMITS = dataclasses.replace(LIMITS, obstacles=Obstacles.none())
 
 
@@ -110,7 +110,7 @@ def test_margin_is_kept() -> None:
 def test_what_was_moved_far_counts_less_and_what_cannot_be_repaired_least() -> None:
     still = POSTERIOR.mean_m[:1, None].expand(1, 3, -1, -1).clone()
     still[0, :2] += torch.tensor([0.0, 40.0])  # two clear of everything, one through the circle
-    limits = LIMITS.for_rows(DATUM[:1])
+    limits = dataclasses.replace(LIMITS, offset_m=DATUM[:1, None, None])
     _, weight, is_feasible = limits.finish(still, POSTERIOR.sigma_m[:1].clamp_min(0.5), LENGTH_M)
     assert is_feasible.all() and weight[0, 0] == weight[0, 1] > weight[0, 2] > 0
     buried = Obstacles(torch.tensor([[1000.0 + float(TIMES[1]), -500.0 + 0.05 * float(TIMES[1]) ** 2, 0.7]]).double())

@@ -18,6 +18,7 @@ from cadence.worlds.recordings import Recordings, cut_windows
 from pipeline.absolute import absolute_grid, load_absolute, placed
 from pipeline.checkpoints import CheckpointInfo, read_info, save_checkpoint
 from pipeline.config import config_as_dict, read_config
+from pipeline.extract import ExtractConfig
 from pipeline.forecasters import load_forecaster
 from pipeline.progress import Progress
 from pipeline.recordings import RecordingsConfig, save_recordings
@@ -215,7 +216,7 @@ def test_training_from_logs(tmp_path):
         logs, SimulateConfig(num_episodes=3, patrol=PatrolConfig(duration_s=3600.0, step_s=30.0, detection_rate=0.4)), QUIET
     )
     (logs / "broken.mcap").write_bytes(b"not an mcap")
-    missions = missions_of_logs(logs, tmp_path / "run" / "logs", PAPER.extract, QUIET)
+    missions = missions_of_logs(logs, tmp_path / "run" / "logs", ExtractConfig(), QUIET)
     assert [mission.name for mission in missions] == [f"patrol-0-000{i}" for i in range(3)]
     assert all(len(mission.truth) == 121 for mission in missions)
     result = train(tmp_path / "run", config(2, data=logs), QUIET)
