@@ -1,6 +1,6 @@
 """The paper's table I again: who forecasts best, on our five sets of simulated episodes and on recorded ones?
 
-Fifty evaluation episodes a set with a seed of their own, 2000 random windows, 30 hypotheses, errors at 0/30/60/90/120 min over
+Evaluation episodes with a seed of their own (fifty a set, if not told otherwise), 2000 random windows, 30 hypotheses, errors at 0/30/60/90/120 min over
 the map side (`pipeline.forecasts`). Learned methods are checkpoints that are found by name in --checkpoints (below); what is
 not found is named on the page and left out. Scores are kept in blocks of windows under --work: a killed run goes on.
 
@@ -61,14 +61,14 @@ class Case:
         return f"{self.world} {self.set}"
 
 
-def world_cases(num_training: int, num_everything: int) -> Iterator[Case]:
+def world_cases(num_episodes: int, num_training: int, num_everything: int) -> Iterator[Case]:
     """Our five sets."""
     for world, sets in (("prison", ("low", "med", "high")), ("narco", ("low", "high"))):
         for name in sets:
             of = functools.partial(RecordingsConfig, world=world, set=name)
             training = of(seed=TRAINING_SEED, num_episodes=num_training)
             everything = of(seed=TRAINING_SEED, num_episodes=num_everything)
-            yield Case(world, name, of(seed=EVALUATION_SEED, num_episodes=50), (training,), (everything,))
+            yield Case(world, name, of(seed=EVALUATION_SEED, num_episodes=num_episodes), (training,), (everything,))
 
 
 def reference_cases(folder: Path, extra: Path | None) -> Iterator[Case]:
@@ -207,6 +207,7 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--extra", type=Path, help="npz of more recorded episodes of the set low, for the library")
     parser.add_argument("--sets", nargs="*", help='only these, as in "prison low"')
     parser.add_argument("--windows", type=int, default=2000)
+    parser.add_argument("--episodes", type=int, default=50, help="to evaluate on, of each of our sets")
     parser.add_argument("--hypotheses", type=int, default=30)
     parser.add_argument("--training-episodes", type=int, default=300, help="of each set, for the library and the filters")
     parser.add_argument("--all-episodes", type=int, default=2000, help='of each set, for "library, all episodes"')
@@ -224,7 +225,7 @@ def main() -> int:
     scene = SceneSampling(precision=args.precision)
     config = ForecastConfig(args.windows, args.hypotheses, rivals=(), paper=sampling, scene=scene)
     setup = Setup(args.checkpoints, args.work, config, Progress(args.quiet))
-    cases = list(world_cases(args.training_episodes, args.all_episodes))
+    cases = list(world_cases(args.episodes, args.training_episodes, args.all_episodes))
     if args.reference is not None:
         cases += reference_cases(args.reference, args.extra)
     cases = [case for case in cases if not args.sets or case.name in args.sets]
