@@ -1,8 +1,9 @@
 """The paper's table I again: who forecasts best, on our five sets of simulated episodes and on recorded ones?
 
-Evaluation episodes with a seed of their own (fifty a set, if not told otherwise), 2000 random windows, 30 hypotheses, errors at 0/30/60/90/120 min over
-the map side (`pipeline.forecasts`). Learned methods are checkpoints that are found by name in --checkpoints (below); what is
-not found is named on the page and left out. Scores are kept in blocks of windows under --work: a killed run goes on.
+Evaluation episodes with a seed of their own (fifty a set unless --episodes says more), 2000 random windows, 30 hypotheses,
+errors at 0/30/60/90/120 min over the map side (`pipeline.forecasts`). Learned methods are checkpoints that are found by name in
+--checkpoints (below); what is not found is named on the page and left out. Scores are kept in blocks of windows under --work: a
+killed run goes on.
 
 A checkpoint is NAME.safetensors or NAME/checkpoint.safetensors; of the names METHOD-WORLD-SET-sN, METHOD-WORLD-SET,
 METHOD-WORLD-sN and METHOD-WORLD the first that is found counts, for every training seed N. METHOD is vrnn, grammi_without_mi,

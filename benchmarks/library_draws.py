@@ -1,0 +1,200 @@
+"""What would recorded tracks add to the network? Its forecasts beside those of the trajectory library, and both together.
+
+The library needs no training, so that it shows what a network could still learn: for every set of validation episodes, the
+energy score of the library with a growing number of simulated tracks, of the shipped network, and of forecasts of which a
+share is drawn from the library. Kept under --work: a killed run goes on.
+
+    python benchmarks/library_draws.py --reference ../shared/data/prison_reference --publish docs/benchmarks
+"""
+
+import argparse
+import dataclasses
+import functools
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from cadence.baselines.library import TrajectoryLibrary
+from cadence.constraints.obstacles import Obstacles
+from cadence.diffusion.scene import SceneSampling
+from cadence.types import Context, Estimator, HypothesisSet, WindowBatch
+from pipeline.checkpoints import checkpoint_hash, find_checkpoint
+from pipeline.forecast_leads import relative_lead
+from pipeline.forecast_scores import HORIZONS, EpisodeScores
+from pipeline.forecast_tables import line, mean_interval, number, with_interval
+from pipeline.forecasters import Unguided
+from pipeline.forecasts import ForecastConfig, ForecastRun, forecast_windows
+from pipeline.manifest import write_atomic
+from pipeline.placed_draws import Forecaster
+from pipeline.progress import Progress
+from pipeline.recordings import RecordingsConfig, RecordingSet, load_recordings
+from pipeline.scene import load_scene
+
+FIRST_TRACK = 500
+"""Narco's checkpoint was chosen on the episodes before it, which are evaluated on here."""
+MEASURES = {"error of the mean": "mean_error", "ADE": "ade", "minADE": "min_ade_at"}
+NUM_RESAMPLES = 1000
+
+
+@dataclass(frozen=True)
+class Case:
+    """A set of validation episodes, the checkpoint that forecasts it and the world and set of the library's tracks."""
+
+    name: str
+    episodes: RecordingsConfig
+    world: str
+    set: str
+
+
+def all_cases(reference: Path | None) -> list[Case]:
+    """The recorded sets first, where --reference says where they are."""
+    found = []
+    for name in ("low", "med", "high"):
+        if reference is not None:
+            logs = RecordingsConfig(data=reference / name, pattern="**/*_02[5-9][0-9].mcap")
+            found.append(Case(f"recorded {name}", logs, "prison", name))
+        own = RecordingsConfig(set=name, num_episodes=100, seed=1)  # type: ignore[arg-type]
+        found.append(Case(f"prison {name}", own, "prison", name))
+    for name in ("low", "high"):
+        own = RecordingsConfig(world="narco", set=name, num_episodes=100, seed=0)  # type: ignore[arg-type]
+        found.append(Case(f"narco {name}", own, "narco", name))
+    return sorted(found, key=lambda case: not case.name.startswith("recorded"))
+
+
+@dataclass(frozen=True, eq=False)
+class Together:
+    """A share of every window's hypotheses is drawn from the library, the others by the network."""
+
+    network: Forecaster
+    library: TrajectoryLibrary
+    share: float
+    name: str = "together"
+
+    def placed(self, context: Context, obstacles: Obstacles | None = None) -> "_TogetherHere":
+        """Both in their place."""
+        return _TogetherHere(self.network.placed(context, obstacles), self.library.placed(context), self.share)
+
+
+@dataclass(frozen=True, eq=False)
+class _TogetherHere:
+    network: Estimator
+    library: Estimator
+    share: float
+    name: str = "together"
+
+    def sample(self, windows: WindowBatch, num_hypotheses: int) -> HypothesisSet:
+        """Hypotheses [B, K, A, T, 2], the network's first, all with the same weight."""
+        num_library = round(self.share * num_hypotheses)
+        drawn = self.network.sample(windows, num_hypotheses - num_library)
+        more = self.library.sample(windows, num_library)
+        positions = torch.cat([drawn.position_m, more.position_m.to(drawn.position_m)], dim=1)
+        weight = torch.full(positions.shape[:2], 1.0 / num_hypotheses, dtype=drawn.weight.dtype)
+        return dataclasses.replace(drawn, position_m=positions, weight=weight)
+
+
+def score_case(case: Case, options: argparse.Namespace, progress: Progress) -> dict[str, EpisodeScores]:
+    """Scores of every row."""
+    cache = options.work / "episodes"
+    episodes = load_recordings(case.episodes, cache, progress)
+    config = ForecastConfig(options.windows, options.hypotheses, rivals=(), known_goal=False)
+    windows = forecast_windows(episodes.recordings, config)
+    run = ForecastRun(episodes, windows, options.hypotheses, options.work / "scores", progress, tells_obstacles=False)
+    weights = find_checkpoint(case.world)
+    sampling = SceneSampling(precision="bfloat16")
+    network = functools.cache(lambda: load_scene(weights, sampling))
+    tracks = functools.partial(_tracks, case, cache, progress)
+    library = functools.cache(lambda count: TrajectoryLibrary.from_recordings(tracks(count).recordings))
+    trained = [checkpoint_hash(weights), sampling]
+    found = {"CADENCE": run.score(f"cadence-{case.name}", network, list(trained))}
+    for count in options.tracks:
+        known = ["library", count, FIRST_TRACK]
+        title = f"library of {count:,} tracks".replace(",", " ")
+        found[title] = run.score(f"library-{case.name}", functools.partial(_alone, library, count), known)
+        for share in options.shares:
+            build = functools.partial(_together, network, library, count, share)
+            label = f"CADENCE, {share:.0%} of {title.removeprefix('library of ')}"
+            found[label] = run.score(f"together-{case.name}", build, [*trained, *known, share])
+    return found
+
+
+def _together(
+    network: Callable[[], Forecaster], library: Callable[[int], TrajectoryLibrary], count: int, share: float
+) -> Together:
+    return Together(network(), library(count), share)
+
+
+def _alone(library: Callable[[int], TrajectoryLibrary], count: int) -> Unguided:
+    return Unguided(library(count))
+
+
+def _tracks(case: Case, cache: Path, progress: Progress, count: int) -> RecordingSet:
+    config = RecordingsConfig(world=case.world, set=case.set, first_index=FIRST_TRACK, num_episodes=count)  # type: ignore[arg-type]
+    return load_recordings(config, cache, progress)
+
+
+def row(name: str, own: EpisodeScores, first: EpisodeScores, unit_m: float) -> str:
+    """Energy score, what it is worse than CADENCE's by in per cent, and the other measures; means over the horizons."""
+    value = mean_interval(own.measure("energy_score").mean(axis=1) / unit_m, own, 0, NUM_RESAMPLES)
+    cells = [name, with_interval(value.value, value.low, value.high)]
+    if own is first:
+        cells.append("0")
+    else:
+        lead = relative_lead([own], [[first]], "energy_score", "energy_score", HORIZONS, 0, NUM_RESAMPLES)
+        cells.append(with_interval(-100 * lead.value, -100 * lead.high, -100 * lead.low, 2))
+    cells += [number(own.mean(measure).mean() / unit_m) for measure in MEASURES.values()]
+    cells.append(number(100 * own.mean("coverage_90").mean()))
+    return line(cells)
+
+
+def page(scores: Mapping[str, tuple[dict[str, EpisodeScores], float]], options: argparse.Namespace, command: str) -> str:
+    """The page."""
+    lines = [
+        "# What recorded tracks would add to the network", "", f"    {command}", "",
+        f"{options.windows} windows a set of validation episodes (recorded: seeds 250 to 299; ours: 100 episodes), "
+        f"{options.hypotheses} hypotheses, nobody told the hideout, no obstacles told. Tracks of the library are simulated "
+        "ones of the same set, none of them evaluated on. Rows with a share draw that many of the hypotheses from the library "
+        "and the others from the network. Energy score, error of the mean, ADE and minADE are means over the horizons 0 to "
+        "120 min over the map's side; *worse by* is the energy score against CADENCE's, negative where better. Brackets: 95 % "
+        "bootstrap over episodes, paired.", "",
+    ]  # fmt: skip
+    for name, (rows, unit_m) in scores.items():
+        lines += [
+            f"## {name}",
+            "",
+            line(["", "energy score", "worse by, %", *MEASURES, "90 % region holds, %"]),
+            line(["---"] * 7),
+        ]
+        lines += [row(title, own, rows["CADENCE"], unit_m) for title, own in rows.items()] + [""]
+    return "\n".join(lines)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Score, print and publish."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--reference", type=Path, help="folder of recorded logs: low, med, high")
+    parser.add_argument("--work", type=Path, default=Path("runs/library_draws"))
+    parser.add_argument("--windows", type=int, default=400)
+    parser.add_argument("--hypotheses", type=int, default=30)
+    parser.add_argument("--tracks", type=int, nargs="+", default=[300, 3500])
+    parser.add_argument("--shares", type=float, nargs="+", default=[0.5])
+    parser.add_argument("--publish", type=Path, help="folder for library_draws.md")
+    options = parser.parse_args(arguments)
+    torch.set_num_threads(1)
+    progress, scores = Progress(), {}
+    for case in all_cases(options.reference):
+        progress.note(case.name)
+        unit_m = load_recordings(case.episodes, options.work / "episodes", progress).scale_m
+        assert unit_m is not None
+        scores[case.name] = (score_case(case, options, progress), unit_m)
+    text = page(scores, options, " ".join(["python benchmarks/library_draws.py", *sys.argv[1:]]))
+    sys.stdout.write(text)
+    if options.publish is not None:
+        write_atomic(options.publish / "library_draws.md", text)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
