@@ -294,7 +294,8 @@ def facts(options: argparse.Namespace, task: Task) -> dict[str, object]:
         "hypotheses": task.num_hypotheses,
         "checkpoint": " and ".join(checkpoint_hash(find_checkpoint(name)) for name in names),
         "versions": ", ".join(f"{name} {number}" for name, number in versions().items()),
-        "arguments": f"--windows {options.windows} --hypotheses {options.hypotheses} --seed {options.seed}",
+        "arguments": f"--windows {options.windows} --hypotheses {options.hypotheses} --seed {options.seed}"
+        + (f" --tuned {options.tuned}" if options.tuned else ""),
     }
 
 
