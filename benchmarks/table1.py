@@ -20,6 +20,7 @@ import argparse
 import dataclasses
 import functools
 import json
+import shlex
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -240,7 +241,7 @@ def main() -> int:
         setup.progress.note(case.name)
         evaluated[case.name] = evaluate_case(case, setup, missing)
     shown = [word for word in sys.argv[1:] if word not in ("-q", "--quiet")]
-    text = page(evaluated, missing, " ".join(["python benchmarks/table1.py", *shown]), config)
+    text = page(evaluated, missing, shlex.join(["python", "benchmarks/table1.py", *shown]), config)
     sys.stdout.write(text)
     if args.publish is not None:
         write_atomic(args.publish / f"{args.name}.json", json.dumps(record(evaluated, missing, config.seed), indent=1) + "\n")
