@@ -345,7 +345,7 @@ def page(setup: Setup, results: Mapping[str, Scores], counts: Mapping[str, int],
         *(picture if with_picture else []),
         *curve_table(results),
         "Draws of the trajectory library as a further input were not tried: windows would have to be matched against the "
-        "library in every training step. What its draws add to the forecasts: library_draws.md.", "",
+        "library in every training step. What they add to the forecasts: [library_draws.md](library_draws.md).", "",
     ]  # fmt: skip
     lines += [f"Not run yet: {'; '.join(missing)}.", ""] if missing else []
     lines += [
