@@ -11,21 +11,21 @@ import argparse
 import dataclasses
 import functools
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 
-from cadence.baselines.library import TrajectoryLibrary
 from cadence.constraints.obstacles import Obstacles
 from cadence.diffusion.scene import SceneSampling
-from cadence.types import Context, Estimator, HypothesisSet, WindowBatch
+from cadence.types import Context, HypothesisSet, WindowBatch
 from pipeline.checkpoints import checkpoint_hash, find_checkpoint
 from pipeline.forecast_leads import relative_lead
 from pipeline.forecast_scores import HORIZONS, EpisodeScores
 from pipeline.forecast_tables import line, mean_interval, number, with_interval
-from pipeline.forecasters import Unguided
+from pipeline.forecasters import FORECAST_RIVALS
 from pipeline.forecasts import ForecastConfig, ForecastRun, forecast_windows
 from pipeline.manifest import write_atomic
 from pipeline.placed_draws import Forecaster
@@ -66,24 +66,17 @@ def all_cases(reference: Path | None) -> list[Case]:
 
 @dataclass(frozen=True, eq=False)
 class Together:
-    """A share of every window's hypotheses is drawn from the library, the others by the network."""
+    """A share of every window's hypotheses is drawn from the library, the others by the network; both are placed alike."""
 
-    network: Forecaster
-    library: TrajectoryLibrary
+    network: Any
+    library: Any
     share: float
     name: str = "together"
 
-    def placed(self, context: Context, obstacles: Obstacles | None = None) -> "_TogetherHere":
+    def placed(self, context: Context, obstacles: Obstacles | None = None) -> "Together":
         """Both in their place."""
-        return _TogetherHere(self.network.placed(context, obstacles), self.library.placed(context), self.share)
-
-
-@dataclass(frozen=True, eq=False)
-class _TogetherHere:
-    network: Estimator
-    library: Estimator
-    share: float
-    name: str = "together"
+        here = {"network": self.network.placed(context, obstacles), "library": self.library.placed(context, obstacles)}
+        return dataclasses.replace(self, **here)
 
     def sample(self, windows: WindowBatch, num_hypotheses: int) -> HypothesisSet:
         """Hypotheses [B, K, A, T, 2], the network's first, all with the same weight."""
@@ -95,44 +88,35 @@ class _TogetherHere:
         return dataclasses.replace(drawn, position_m=positions, weight=weight)
 
 
-def score_case(case: Case, options: argparse.Namespace, progress: Progress) -> dict[str, EpisodeScores]:
+def score_case(case: Case, episodes: RecordingSet, options: argparse.Namespace, progress: Progress) -> dict[str, EpisodeScores]:
     """Scores of every row."""
-    cache = options.work / "episodes"
-    episodes = load_recordings(case.episodes, cache, progress)
     config = ForecastConfig(options.windows, options.hypotheses, rivals=(), known_goal=False)
     windows = forecast_windows(episodes.recordings, config)
     run = ForecastRun(episodes, windows, options.hypotheses, options.work / "scores", progress, tells_obstacles=False)
-    weights = find_checkpoint(case.world)
-    sampling = SceneSampling(precision="bfloat16")
-    network = functools.cache(lambda: load_scene(weights, sampling))
-    tracks = functools.partial(_tracks, case, cache, progress)
-    library = functools.cache(lambda count: TrajectoryLibrary.from_recordings(tracks(count).recordings))
+    weights, sampling = find_checkpoint(case.world), SceneSampling(precision="bfloat16")
     trained = [checkpoint_hash(weights), sampling]
+
+    @functools.cache
+    def network() -> Forecaster:
+        return load_scene(weights, sampling)
+
+    @functools.cache
+    def library(count: int) -> Forecaster:
+        tracks = RecordingsConfig(world=case.world, set=case.set, first_index=FIRST_TRACK, num_episodes=count)  # type: ignore[arg-type]
+        return FORECAST_RIVALS["library"](load_recordings(tracks, options.work / "episodes", progress).recordings)
+
+    def together(count: int, share: float) -> Forecaster:
+        return Together(network(), library(count), share)
+
     found = {"CADENCE": run.score(f"cadence-{case.name}", network, list(trained))}
     for count in options.tracks:
         known = ["library", count, FIRST_TRACK]
-        title = f"library of {count:,} tracks".replace(",", " ")
-        found[title] = run.score(f"library-{case.name}", functools.partial(_alone, library, count), known)
+        title = f"{count:,} tracks".replace(",", " ")
+        found[f"library of {title}"] = run.score(f"library-{case.name}", functools.partial(library, count), known)
         for share in options.shares:
-            build = functools.partial(_together, network, library, count, share)
-            label = f"CADENCE, {share:.0%} of {title.removeprefix('library of ')}"
-            found[label] = run.score(f"together-{case.name}", build, [*trained, *known, share])
+            build = functools.partial(together, count, share)
+            found[f"CADENCE, {share:.0%} of {title}"] = run.score(f"together-{case.name}", build, [*trained, *known, share])
     return found
-
-
-def _together(
-    network: Callable[[], Forecaster], library: Callable[[int], TrajectoryLibrary], count: int, share: float
-) -> Together:
-    return Together(network(), library(count), share)
-
-
-def _alone(library: Callable[[int], TrajectoryLibrary], count: int) -> Unguided:
-    return Unguided(library(count))
-
-
-def _tracks(case: Case, cache: Path, progress: Progress, count: int) -> RecordingSet:
-    config = RecordingsConfig(world=case.world, set=case.set, first_index=FIRST_TRACK, num_episodes=count)  # type: ignore[arg-type]
-    return load_recordings(config, cache, progress)
 
 
 def row(name: str, own: EpisodeScores, first: EpisodeScores, unit_m: float) -> str:
@@ -186,9 +170,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     progress, scores = Progress(), {}
     for case in all_cases(options.reference):
         progress.note(case.name)
-        unit_m = load_recordings(case.episodes, options.work / "episodes", progress).scale_m
-        assert unit_m is not None
-        scores[case.name] = (score_case(case, options, progress), unit_m)
+        episodes = load_recordings(case.episodes, options.work / "episodes", progress)
+        assert episodes.scale_m is not None
+        scores[case.name] = (score_case(case, episodes, options, progress), episodes.scale_m)
     text = page(scores, options, " ".join(["python benchmarks/library_draws.py", *sys.argv[1:]]))
     sys.stdout.write(text)
     if options.publish is not None:

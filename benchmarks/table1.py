@@ -13,7 +13,7 @@ low, med or high.
     python benchmarks/table1.py --publish docs/benchmarks
     python benchmarks/table1.py --reference ../shared/data/prison_reference --publish docs/benchmarks
 
-The paper's preset takes 15 times as long to sample as CADENCE; --methods leaves it out.
+The paper's preset takes some 20 times as long to sample as CADENCE; --methods leaves it out.
 """
 
 import argparse
