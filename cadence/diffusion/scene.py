@@ -128,6 +128,11 @@ class SceneModel:
                 f"infer.grid: this checkpoint predicts {NUM_STEPS} steps of {step_s:g} s from now on; set step_s = {step_s:g}, "
                 f"history_steps = 1, horizon_steps = {NUM_STEPS - 1}"
             )
+        sampler, tuned = self.sampling.sampler, self.config.few_steps
+        if sampler == "few" and not tuned:
+            raise ConfigError("infer.scene.sampler: 'few', but these weights were not tuned for few steps; use dpmpp, ddim or ddpm")
+        if tuned and sampler not in ("auto", "few"):
+            raise ConfigError(f"infer.scene.sampler: {sampler!r}, but these weights were tuned for {tuned} steps of their own; use auto")
         if self.config.network.attention_heads and windows.num_agents > MAX_AGENTS:
             raise ConfigError(
                 f"infer.checkpoint: this checkpoint draws at most {MAX_AGENTS} agents together, here are {windows.num_agents}; "
@@ -168,10 +173,8 @@ class SceneModel:
 
     def _solved(self, denoise: Callable[[Tensor, float], Tensor], start: Tensor, stream: RowNoise, tracks: "_Tracks") -> Tensor:
         sampler, steps = self.sampling.sampler, self.sampling.num_steps
-        if sampler in ("auto", "few") and self.config.few_steps:
+        if self.config.few_steps:
             return sample_ddim(denoise, start, even_angles(self.config.few_steps))
-        if sampler == "few":
-            raise ConfigError("sampler 'few': these weights were not tuned for few steps; use dpmpp, ddim or ddpm")
         if sampler == "ddpm":
             on_mean = tracks.paper_guided if self.sampling.guidance == "paper" else _keep
             return sample_ddpm(denoise, start, cosine_schedule(steps), lambda like: stream.draw(like.shape[1:]), on_mean)
