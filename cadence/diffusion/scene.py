@@ -130,9 +130,9 @@ class SceneModel:
             )
         sampler, tuned = self.sampling.sampler, self.config.few_steps
         if sampler == "few" and not tuned:
-            raise ConfigError("infer.scene.sampler: 'few', but these weights were not tuned for few steps; use dpmpp, ddim or ddpm")
+            raise ConfigError("scene.sampler: 'few', but these weights were not tuned for few steps; use dpmpp, ddim or ddpm")
         if tuned and sampler not in ("auto", "few"):
-            raise ConfigError(f"infer.scene.sampler: {sampler!r}, but these weights were tuned for {tuned} steps of their own; use auto")
+            raise ConfigError(f"scene.sampler: {sampler!r}, but these weights were tuned for {tuned} steps of their own; use auto")
         if self.config.network.attention_heads and windows.num_agents > MAX_AGENTS:
             raise ConfigError(
                 f"infer.checkpoint: this checkpoint draws at most {MAX_AGENTS} agents together, here are {windows.num_agents}; "
