@@ -41,8 +41,8 @@ straight line between two knots on an edge cuts through the obstacle, and what i
 class SceneSampling:
     """How a scene model is sampled.
 
-    sampler     "few": the few steps that the weights were tuned for; "ddpm", "ddim", "dpmpp": any number for weights that
-                were trained by diffusion alone; "auto": few where the weights are tuned, else dpmpp
+    sampler     "few": the few steps that the weights were tuned for, which take no other; "ddpm", "ddim", "dpmpp": any number
+                for weights that were trained by diffusion alone; "auto": few where the weights are tuned, else dpmpp
     num_steps   of ddpm, ddim and dpmpp
     guidance    away from obstacles: "final" moves the finished track, "clean" every clean estimate, "paper" every mean
                 (algorithm 1; with ddpm), "none". Moved while it is still uncertain, a track becomes another one; the finished
@@ -132,7 +132,7 @@ class SceneModel:
         if sampler == "few" and not tuned:
             raise ConfigError("scene.sampler: 'few', but these weights were not tuned for few steps; use dpmpp, ddim or ddpm")
         if tuned and sampler not in ("auto", "few"):
-            raise ConfigError(f"scene.sampler: {sampler!r}, but these weights were tuned for {tuned} steps of their own; use auto")
+            raise ConfigError(f"scene.sampler: {sampler!r}, but these weights were tuned for {tuned} steps; use auto")
         if self.config.network.attention_heads and windows.num_agents > MAX_AGENTS:
             raise ConfigError(
                 f"infer.checkpoint: this checkpoint draws at most {MAX_AGENTS} agents together, here are {windows.num_agents}; "
