@@ -199,7 +199,7 @@ def test_refusals_name_what_to_do() -> None:
         model().placed(cut.context).sample(dataclasses.replace(cut.windows, time_s=cut.windows.time_s * 2), 2)
     with pytest.raises(ConfigError, match="not tuned"):
         model(SceneSampling(sampler="few")).placed(cut.context).sample(cut.windows, 2)
-    with pytest.raises(ConfigError, match="'ddim', but .* 2 steps"):
+    with pytest.raises(ConfigError, match=r"'ddim', but .* 2 steps"):
         tuned = dataclasses.replace(CONFIG, few_steps=2)
         model(SceneSampling(sampler="ddim"), tuned).placed(cut.context).sample(cut.windows, 2)
     with pytest.raises(ValueError, match="placed"):
