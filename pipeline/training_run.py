@@ -4,6 +4,7 @@ import csv
 import io
 import os
 import sys
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -75,6 +76,8 @@ def run_training(
     if trainer.step:
         progress.note(f"train: going on at step {trainer.step} of {run.num_steps}")
     recent: list[float] = []
+    spent = _cpu_seconds(run.out / OUTPUTS[0]) if trainer.step else _cpu_seconds(run.start)
+    begin = time.process_time()
     with progress.bar(run.num_steps, "train", unit="step") as bar:
         bar.update(trainer.step)
         while trainer.step < run.num_steps:
@@ -86,7 +89,7 @@ def run_training(
                 recent = []
                 bar.set_postfix_str(f"loss {curve[-1][1]:.4f}, validation {curve[-1][2]:.4f}")
             if trainer.step % run.config.save_every == 0 or is_last:
-                _save(run, trainer, curve)
+                _save(run, trainer, curve, None if spent is None else spent + time.process_time() - begin)
     _draw_curve(run.out, curve)
     summary: dict[str, Any] = {"steps": trainer.step, "checkpoint": str(run.out / OUTPUTS[0])}
     summary["validation_loss"] = curve[-1][2] if curve else None
@@ -106,7 +109,7 @@ def _resume(run: TrainingRun, trainer: Trainer) -> Curve:
         raise InputError(f"{path}: the state to go on from cannot be read ({error}); start anew with --force") from error
 
 
-def _save(run: TrainingRun, trainer: Trainer, curve: Curve) -> None:
+def _save(run: TrainingRun, trainer: Trainer, curve: Curve, cpu_seconds: float | None) -> None:
     table = io.StringIO()
     csv.writer(table).writerows([("step", "loss", "validation_loss"), *curve])
     write_atomic(run.out / "curve.csv", table.getvalue())
@@ -119,6 +122,7 @@ def _save(run: TrainingRun, trainer: Trainer, curve: Curve) -> None:
         "config": config_as_dict(run.config),
         "steps": trainer.step,
         "windows": trainer.step * run.config.batch_size + _windows_before(run.start),
+        "cpu_seconds": cpu_seconds,
     }
     scores = {"validation_loss": curve[-1][2]} if curve else {}
     info = CheckpointInfo(run.preset, config_as_dict(run.network), training, scores)
@@ -128,6 +132,14 @@ def _save(run: TrainingRun, trainer: Trainer, curve: Curve) -> None:
 def _windows_before(start: Path | None) -> int:
     """Windows that the checkpoint has seen that a training began with, itself and those before it."""
     return 0 if start is None else int(windows_seen(read_info(start).training) or 0)
+
+
+def _cpu_seconds(checkpoint: Path | None) -> float | None:
+    """Processor time behind a checkpoint, all that it began with included; 0 without one, None where it does not say."""
+    if checkpoint is None:
+        return 0.0
+    seconds = read_info(checkpoint).training.get("cpu_seconds") if checkpoint.is_file() else None
+    return None if seconds is None else float(seconds)
 
 
 def _draw_curve(out: Path, curve: Curve) -> None:

@@ -59,8 +59,10 @@ def test_a_killed_training_goes_on_and_ends_as_an_unbroken_one(preset, tmp_path)
         train_rival(tmp_path / "broken", config(preset), *parts, Killer(5))
     again = train_rival(tmp_path / "broken", config(preset), *parts, QUIET)
     assert again.summary["steps"] == 6
-    for name in ("checkpoint.safetensors", "checkpoint.json", "curve.csv", "best.json"):
+    for name in ("checkpoint.safetensors", "curve.csv", "best.json"):
         assert (tmp_path / "broken" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes(), name
+    found = [json.loads((tmp_path / folder / "checkpoint.json").read_text()) for folder in ("broken", "whole")]
+    assert all(item["training"].pop("cpu_seconds") > 0 for item in found) and found[0] == found[1]
     other = train_rival(tmp_path / "other", config(preset, seed=1), *parts, QUIET)
     assert other.summary["validation_loss"] != again.summary["validation_loss"]
 
@@ -137,7 +139,8 @@ def test_a_vrnn_goes_on_from_another_training(tmp_path):
     second = train_rival(tmp_path / "second", going_on, *parts, QUIET).outputs[0]
     for a, b in zip(*(load_rival(path).network.parameters() for path in (first, second)), strict=True):
         torch.testing.assert_close(a, b)
-    assert read_info(second).training["windows"] == 7 * 16
+    before, after = (read_info(path).training for path in (first, second))
+    assert after["windows"] == 7 * 16 and after["cpu_seconds"] > before["cpu_seconds"] > 0
 
 
 def test_presets_by_configuration_with_sources(tmp_path):
