@@ -14,7 +14,6 @@ import dataclasses
 import functools
 import json
 import sys
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,7 +28,7 @@ from cadence.network.scene import SceneNetwork
 from cadence.training.loop import OptimiserConfig
 from cadence.worlds.prison_map import SIDE, prison_map
 from cadence.worlds.recordings import Recordings
-from pipeline.checkpoints import checkpoint_hash
+from pipeline.checkpoints import checkpoint_hash, read_info
 from pipeline.forecast_leads import averaged, relative_lead
 from pipeline.forecast_scores import HORIZONS, EpisodeScores
 from pipeline.forecast_tables import comparison, line, mean_interval, number, with_interval
@@ -188,16 +187,15 @@ def run_variant(
     if path.is_file():
         return
     variant, out = ALL[name], setup.work / "trainings" / path.stem
-    is_fresh, begin = not (out / "state.safetensors").is_file(), time.process_time()
     simulated = [run.episodes.recordings for key, run in runs.items() if key.startswith("simulated")]
     held_out = EpisodePool(tuple(simulated), (1.0,) * len(simulated))
     config = train_config(variant, setup, seed)
     result = train_scene_network(out, config, build(variant, seed), load(variant.num_episodes), held_out, setup.progress)
-    seconds = time.process_time() - begin
     weights = result.outputs[0]
+    seconds = read_info(weights).training["cpu_seconds"]
     estimate = functools.partial(load_scene, weights)
     scores = {key: run.score(f"{name}-{key}", estimate, [checkpoint_hash(weights)]).as_json() for key, run in runs.items()}
-    record = {"variant": name, "seed": seed, "steps": setup.steps, "cpu_seconds": seconds if is_fresh else None}
+    record = {"variant": name, "seed": seed, "steps": setup.steps, "cpu_seconds": seconds}
     write_atomic(path, json.dumps({**record, "validation_loss": result.summary["validation_loss"], "scores": scores}) + "\n")
 
 

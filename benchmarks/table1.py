@@ -198,7 +198,7 @@ def candidates(name: str, case: Case, seed: int) -> list[str]:
 
 def budget(training: Mapping[str, Any]) -> dict[str, Any]:
     """Steps, windows seen and processor time of a training, as far as its checkpoint says."""
-    seconds = next((training[key] for key in ("cpu_seconds", "cpu_s", "seconds") if key in training), None)
+    seconds = training.get("cpu_seconds")
     hours = None if seconds is None else seconds / 3600.0
     return {"steps": training.get("steps"), "windows": windows_seen(training), "cpu_hours": hours}
 

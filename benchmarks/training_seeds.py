@@ -240,13 +240,12 @@ def page(found: Mapping[World, tuple[Scores, float]], setup: Setup, command: str
         "The learned methods of [table I](table1.md) on the sets low of both worlds, trained anew with seeds of their own for",
         f"weights, windows and noise, on the same {NUM_EPISODES - NUM_VALIDATION:,} episodes of that set alone, with",
         f"{setup.steps * setup.batch_size:,} windows each (GrAMMI a sixth more: it goes on from the one without). The shipped",
-        "networks saw up to twelve times as many, of all sets of their world, so that the scores here are worse; what this page",
-        "is for is the spread. The rest is as in table I:",
-        f"{setup.config.num_windows} random moments of {NUM_EVALUATION} episodes with a seed of their own,",
+        "networks saw up to twelve times as many, of all sets of their world; what this page is for is the spread. The rest is",
+        f"as in table I: {setup.config.num_windows} random moments of {NUM_EVALUATION} episodes with a seed of their own,",
         f"{setup.config.num_hypotheses} hypotheses, distances over the map's longer side, nobody told the hideout.", "",
         "Square brackets: 95 % interval, bootstrap over episodes. ±: standard deviation between the training seeds.", "",
     ]  # fmt: skip
-    for world, (scores, scale_m) in found.items():
+    for world, (scores, _) in found.items():
         lines += [f"## {world} low: CADENCE against the better GrAMMI", "", *lead_table(scores)]
     for world, (scores, scale_m) in found.items():
         lines += [f"## {world} low: means over the seeds", "", *spread_tables(scores, scale_m)]
