@@ -64,14 +64,22 @@ class GaussianMixture:
         return (self.weight[..., None] * self.mean_m).sum(dim=-2)
 
     def sample(self, num_hypotheses: int, seeds: Tensor) -> Tensor:
-        """Independent draws [B, K, H, 2], metres; a window's depend on its seed (seeds [B]) alone."""
+        """Draws [B, K, H, 2], metres, independent between horizons; a window's depend on its seed (seeds [B]) alone.
+
+        They are spread as evenly as those of the scene model, so that no score tells the way of drawing: in pairs of one
+        component with mirrored noise, the components drawn systematically.
+        """
         k, h = num_hypotheses, self.weight.shape[1]
+        num_pairs = (k + 1) // 2
         streams = [torch.Generator().manual_seed(seed) for seed in seeds.tolist()]
-        choice = torch.zeros(len(seeds), k, h, dtype=torch.float64)
-        noise = torch.zeros(len(seeds), k, h, 2, dtype=torch.float64)
+        choice = torch.zeros(len(seeds), num_pairs, h, dtype=torch.float64)
+        noise = torch.zeros(len(seeds), num_pairs, h, 2, dtype=torch.float64)
         for row, stream in enumerate(streams):
-            choice[row] = torch.rand(k, h, generator=stream, dtype=torch.float64)
-            noise[row] = torch.randn(k, h, 2, generator=stream, dtype=torch.float64)
+            order = torch.rand(num_pairs, h, generator=stream, dtype=torch.float64).argsort(dim=0)
+            choice[row] = (order + torch.rand(h, generator=stream, dtype=torch.float64)) / max(num_pairs, 1)
+            noise[row] = torch.randn(num_pairs, h, 2, generator=stream, dtype=torch.float64)
+        choice = choice.repeat_interleave(2, dim=1)[:, :k]
+        noise = torch.stack([noise, -noise], dim=2).flatten(1, 2)[:, :k]
         cumulated = self.weight.double().cumsum(dim=-1)
         cumulated = cumulated / cumulated[..., -1:]
         component = (choice[..., None] >= cumulated[:, None, :, :-1]).sum(dim=-1)

@@ -16,6 +16,12 @@ class RowNoise:
         """Standard normal [R, *shape]."""
         return torch.stack([torch.randn(tuple(shape), generator=generator) for generator in self.generators])
 
+    def draw_pairs(self, num_hypotheses: int, shape: Sequence[int]) -> Tensor:
+        """Standard normal [R, K, *shape]; every second draw of K mirrors the one before (antithetic variates; Hammersley,
+        Morton, 1956), so that few stand for the distribution better than as many independent ones."""
+        half = self.draw(((num_hypotheses + 1) // 2, *shape))
+        return torch.stack([half, -half], dim=2).flatten(1, 2)[:, :num_hypotheses]
+
     def draw_each(self, num_hypotheses: int, is_used: Tensor) -> Tensor:
         """Standard normal [R, K, N, 2], zero for detections that are not used; left-packed, whatever the padding."""
         noise = torch.zeros(len(is_used), num_hypotheses, is_used.shape[1], 2)

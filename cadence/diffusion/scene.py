@@ -44,6 +44,8 @@ class SceneSampling:
     sampler     "few": the few steps that the weights were tuned for, which take no other; "ddpm", "ddim", "dpmpp": any number
                 for weights that were trained by diffusion alone; "auto": few where the weights are tuned, else dpmpp
     num_steps   of ddpm, ddim and dpmpp
+    is_antithetic  hypotheses come in pairs that begin with mirrored noise: each is still a draw of the distribution, and a few
+                stand for it better than as many independent ones. Not with ddpm, which adds noise at every step
     guidance    away from obstacles: "final" moves the finished track, "clean" every clean estimate, "paper" every mean
                 (algorithm 1; with ddpm), "none". Moved while it is still uncertain, a track becomes another one; the finished
                 track changes least, and leaves little to repair, which is slow
@@ -58,6 +60,7 @@ class SceneSampling:
 
     sampler: Literal["auto", "few", "ddpm", "ddim", "dpmpp"] = "auto"
     num_steps: int = 6
+    is_antithetic: bool = True
     guidance: Literal["none", "final", "clean", "paper"] = "final"
     is_repaired: bool = True
     margin_m: float = 0.0
@@ -159,7 +162,9 @@ class SceneModel:
             clean = clean_from("v", network(flat, angle, pieces, told, mates), flat, torch.tensor(angle)).reshape(noisy.shape)
             return tracks.guided(tracks.limited(clean), "clean")
 
-        start = stream.draw((num_hypotheses, self.config.num_pieces, 2))
+        is_paired = self.sampling.is_antithetic and self.sampling.sampler != "ddpm"
+        shape = (self.config.num_pieces, 2)
+        start = stream.draw_pairs(num_hypotheses, shape) if is_paired else stream.draw((num_hypotheses, *shape))
         sampled = self._solved(denoise, start, stream, tracks)
         sampled = tracks.guided(tracks.limited(sampled), "final")
         positions = future_of(to_track(sampled.double(), inputs.pieces, self.config), self.config)

@@ -116,6 +116,20 @@ def test_draws_belong_to_their_seed_and_horizons_are_independent():
     assert abs(float(torch.corrcoef(points[:, :, 0].T)[0, 1])) < 0.06
 
 
+def test_draws_are_spread_evenly_over_components_and_come_in_mirrored_pairs():
+    weight = torch.tensor([[[0.2, 0.8], [0.6, 0.4]]], dtype=torch.float64)
+    mean = 1000.0 * torch.arange(8, dtype=torch.float64).reshape(1, 2, 2, 2)
+    mixture = GaussianMixture(weight, mean, torch.ones_like(mean))
+    for seed in range(5):
+        draws = mixture.sample(20, torch.tensor([seed]))[0]
+        for horizon, count in ((0, 4), (1, 12)):
+            is_first = (draws[:, horizon] - mean[0, horizon, 0]).norm(dim=-1) < 500
+            assert int(is_first.sum()) == count
+            centre = mean[0, horizon].index_select(0, (~is_first[::2]).long())
+            torch.testing.assert_close(0.5 * (draws[::2, horizon] + draws[1::2, horizon]), centre)
+    assert mixture.sample(3, torch.tensor([1])).shape == (1, 3, 2, 2)
+
+
 def test_tracks_are_straight_between_the_draws():
     points = torch.tensor([[0.0, 0.0], [10.0, 20.0], [10.0, 0.0]])
     track = straight_tracks(points, (0, 5, 7), 9)

@@ -263,7 +263,8 @@ def test_the_energy_score_is_the_unbiased_one() -> None:
 
 def test_the_few_steps_of_training_are_those_of_sampling() -> None:
     cut, config = windows(), dataclasses.replace(CONFIG, few_steps=2)
-    free = dataclasses.replace(model(config=config), sampling=SceneSampling(guidance="none"))
+    plain = SceneSampling(guidance="none", is_antithetic=False)
+    free = dataclasses.replace(model(config=config), sampling=plain)
     free = dataclasses.replace(free, config=dataclasses.replace(config, max_step_m=1e9)).placed(cut.context)
     drawn = free.sample(cut.windows, 2).position_m[:, :, 0]
     inputs = scene_inputs(cut.windows, cut.context, config)
@@ -273,6 +274,22 @@ def test_the_few_steps_of_training_are_those_of_sampling() -> None:
         pieces = few_step_sample(free.network, inputs.pieces.repeated(2), code, noise.flatten(0, 1), 2)
     track = to_track(pieces.reshape(8, 2, 40, 2).double(), inputs.pieces, config)
     assert torch.allclose(future_of(track, config), drawn, atol=0.5)
+
+
+def test_every_second_hypothesis_begins_with_mirrored_noise() -> None:
+    """A network that answers nothing leaves the noise as it is, but for its length."""
+    cut = windows()
+    for sampler, is_mirrored in (("dpmpp", True), ("ddim", True), ("ddpm", False)):
+        silent = model(SceneSampling(sampler=sampler, num_steps=3), std=0.0).placed(cut.context)  # type: ignore[arg-type]
+        tracks = silent.sample(cut.windows, 5).position_m[:, :, 0]
+        middle = 0.5 * (tracks[:, 0:4:2] + tracks[:, 1:4:2])[:, :, :40]
+        spread = (tracks[:, 0:4:2] - tracks[:, 1:4:2])[:, :, :40]
+        assert tracks.shape[1] == 5 and bool((spread.norm(dim=-1) > 0.1).any())
+        same = middle[:, :1].expand_as(middle)  # where the last detection and nothing else leads
+        assert torch.allclose(middle, same, atol=0.5) == is_mirrored, sampler
+    alone = model(SceneSampling(num_steps=3, is_antithetic=False), std=0.0).placed(cut.context)
+    tracks = alone.sample(cut.windows, 4).position_m[:, :, 0]
+    assert not torch.allclose(tracks[:, 0] + tracks[:, 1], tracks[:, 2] + tracks[:, 3], atol=20.0)
 
 
 def test_contexts_are_checked() -> None:
