@@ -17,8 +17,10 @@ class RowNoise:
         return torch.stack([torch.randn(tuple(shape), generator=generator) for generator in self.generators])
 
     def draw_pairs(self, num_hypotheses: int, shape: Sequence[int]) -> Tensor:
-        """Standard normal [R, K, *shape]; every second draw of K mirrors the one before (antithetic variates; Hammersley,
-        Morton, 1956), so that few stand for the distribution better than as many independent ones."""
+        """Standard normal [R, K, *shape], of which every second draw mirrors the one before.
+
+        Few such antithetic draws (Hammersley, Morton, 1956) stand for a distribution better than as many independent ones.
+        """
         half = self.draw(((num_hypotheses + 1) // 2, *shape))
         return torch.stack([half, -half], dim=2).flatten(1, 2)[:, :num_hypotheses]
 

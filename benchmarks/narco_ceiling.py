@@ -1,0 +1,207 @@
+"""How good can a forecast in the world narco be?
+
+A smuggler there takes one of sixteen ways, always at the same speed. So what detections and the time say of it can be written
+down: of all recorded episodes those that were where the target was seen, when it was seen, and that are still under way. Thirty
+of them, drawn evenly, are as good as any forecast that does not read the trackers' positions; here they are scored on the
+windows of table I, beside the rivals and CADENCE. Scores are kept under --work: a killed run goes on.
+
+    python benchmarks/narco_ceiling.py --publish docs/benchmarks
+"""
+
+import argparse
+import dataclasses
+import functools
+import shlex
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, Self
+
+import numpy as np
+import torch
+from table1_page import LATE, MINUTES, NAMES, triples
+
+from cadence.bank.rows import active_rows, scatter_hypotheses
+from cadence.diffusion.scene import SceneSampling
+from cadence.errors import CadenceError
+from cadence.types import Context, Detections, HypothesisSet, WindowBatch
+from cadence.worlds.recordings import Recordings
+from pipeline.checkpoints import checkpoint_hash, find_checkpoint
+from pipeline.forecast_leads import relative_lead
+from pipeline.forecast_scores import HORIZONS, EpisodeScores
+from pipeline.forecast_tables import TITLES, line, with_interval
+from pipeline.forecasters import FORECAST_RIVALS, Samplings, Unguided, load_forecaster
+from pipeline.forecasts import ForecastConfig, ForecastRun, forecast_windows
+from pipeline.manifest import write_atomic
+from pipeline.placed_draws import Forecaster
+from pipeline.progress import Progress
+from pipeline.recordings import RecordingsConfig, load_recordings
+
+SETS = ("low", "high")
+EVALUATION_SEED, TRAINING_SEED = 2_000, 1
+NUM_LIBRARY = 300
+MIXTURES = ("grammi_without_mi", "grammi")
+SAME_M = 100.0
+"""Ways that are nearer to each other than this at the time of a detection cannot be told apart by it."""
+SHOWN = ("energy_score", "displacement_error", "mean_error", "min_ade", "coverage_90")
+NUM_RESAMPLES = 2_000
+
+
+@dataclass(frozen=True, eq=False)
+class SameSoFar:
+    """An estimator: the episodes that were where the target was seen, when it was seen, and are not over."""
+
+    recordings: Recordings
+    context: Context | None = None
+    name: str = "same so far"
+
+    def fit(self, tracks: Detections) -> Self:
+        """The recordings themselves: nothing is fitted."""
+        return self
+
+    def placed(self, context: Context) -> Self:
+        """For windows with this context."""
+        return dataclasses.replace(self, context=context)
+
+    def sample(self, windows: WindowBatch, num_hypotheses: int) -> HypothesisSet:
+        """Continuations [B, K, 1, T, 2] of such episodes, drawn evenly in the order of where they are and go."""
+        context, recordings = self.context, self.recordings
+        assert context is not None and context.elapsed_s is not None
+        steps = np.rint(windows.time_s.double().numpy() / recordings.step_s).astype(np.int64)
+        window = windows.is_active.nonzero(as_tuple=True)[0].numpy()
+        nodes, seeds = active_rows(windows)
+        drawn_m = np.empty((len(window), num_hypotheses, len(steps), 2))
+        for row in range(len(window)):
+            count = int(nodes.is_observed[row].sum())
+            datum_m = context.datum_m[window[row]].double().numpy()
+            now = round(float(context.elapsed_s[window[row]]) / recordings.step_s)
+            at = now + np.rint(nodes.time_s[row, :count].numpy() / recordings.step_s).astype(np.int64)
+            found = self._alike(now, at, nodes.position_m[row, :count].double().numpy() + datum_m)
+            rng = np.random.default_rng(int(seeds[row]))
+            place = ((np.arange(num_hypotheses) + rng.random()) / num_hypotheses * len(found)).astype(np.int64)
+            begin, end = recordings.offset[found[place]], recordings.offset[found[place] + 1] - 1
+            drawn_m[row] = recordings.position_m[np.minimum(begin[:, None] + now + steps, end[:, None])] - datum_m
+        return scatter_hypotheses(torch.from_numpy(drawn_m), windows)
+
+    def _alike(self, now: int, at: np.ndarray, position_m: np.ndarray) -> np.ndarray:
+        """Episodes that last beyond step `now` and were at position_m [N, 2] at the steps `at` [N], sorted by their ways."""
+        begin, place_m = self.recordings.offset[:-1], self.recordings.position_m
+        found = np.flatnonzero(self.recordings.length > now)
+        for step, seen_m in zip(at[::-1], position_m[::-1], strict=True):
+            distance = np.linalg.norm(place_m[begin[found] + step] - seen_m, axis=1)
+            found = found[distance <= max(SAME_M, float(distance.min(initial=0.0)))]
+        here = place_m[begin[found] + now]
+        there = place_m[self.recordings.offset[found + 1] - 1]
+        order: np.ndarray = found[np.lexsort((*there.T, *here.T))]
+        return order
+
+
+@dataclass(frozen=True)
+class Setup:
+    """What the command line says."""
+
+    work: Path
+    num_episodes: int
+    num_training: int
+    config: ForecastConfig
+    progress: Progress
+
+
+def rows_of(name: Literal["low", "high"], setup: Setup) -> tuple[dict[str, EpisodeScores], float]:
+    """Scores of every row of a set, and what distances are divided by."""
+    of = functools.partial(RecordingsConfig, world="narco", set=name)
+    cache = setup.work / "recordings"
+    episodes = load_recordings(of(seed=EVALUATION_SEED, num_episodes=setup.num_episodes), cache, setup.progress)
+    windows = forecast_windows(episodes.recordings, setup.config)
+    run = ForecastRun(episodes, windows, setup.config.num_hypotheses, setup.work / "scores", setup.progress)
+    samplings = Samplings(setup.config.paper, setup.config.scene)
+
+    def training(num: int) -> Recordings:
+        return load_recordings(of(seed=TRAINING_SEED, num_episodes=num), cache, setup.progress).recordings
+
+    def same_so_far() -> Forecaster:
+        return Unguided(SameSoFar(training(setup.num_training)))
+
+    found = {
+        f"same so far, of {setup.num_training:,} episodes": run.score(
+            f"same-narco-{name}", same_so_far, ["same so far", setup.num_training, TRAINING_SEED, SAME_M]
+        ),
+        f"library of {NUM_LIBRARY} episodes": run.score(
+            f"library-narco-{name}",
+            lambda: FORECAST_RIVALS["library"](training(NUM_LIBRARY)),
+            ["library", NUM_LIBRARY, TRAINING_SEED],
+        ),
+    }
+    paths = {NAMES[kind]: Path(__file__).parent / "checkpoints" / f"{kind}-narco.safetensors" for kind in MIXTURES}
+    for title, path in {"CADENCE": find_checkpoint("narco"), **paths}.items():
+        build = functools.partial(load_forecaster, str(path), samplings)
+        found[title] = run.score(f"{title}-narco-{name}", build, [title, checkpoint_hash(path), samplings])
+    assert episodes.scale_m is not None  # the simulator says it
+    return found, episodes.scale_m
+
+
+def set_section(name: str, rows: dict[str, EpisodeScores], scale_m: float, seed: int) -> Iterator[str]:
+    """How far behind the best possible every row is, and all measures."""
+    best_title, best = next(iter(rows.items()))
+    yield from (f"## narco {name}", "", f"How far “{best_title}” is ahead in energy score:", "")
+    yield from (line(["of", "mean lead %", "from 60 min on %"]), line(["---"] * 3))
+    for title, scores in rows.items():
+        if scores is not best:
+            leads = [
+                relative_lead([best], [[scores]], "energy_score", "energy_score", horizons, seed, NUM_RESAMPLES)
+                for horizons in (HORIZONS, LATE)
+            ]
+            yield line([title, *(with_interval(100 * item.value, 100 * item.low, 100 * item.high) for item in leads)])
+    yield ""
+    for measure in SHOWN:
+        unit = 1.0 if measure.startswith("coverage") else scale_m
+        yield from (f"### {TITLES[measure]}: {name}", "", line(["", *MINUTES]), line(["---"] * 6))
+        for title, scores in rows.items():
+            cells = [with_interval(*(value / unit for value in triple)) for triple in triples(scores, measure, seed)]
+            yield line([title, *cells])
+        yield ""
+
+
+def page(setup: Setup, command: str) -> str:
+    """narco_ceiling.md."""
+    lines = [
+        "# How good a forecast can be in narco", "",
+        f"`{command}`", "",
+        "A smuggler takes one of sixteen ways at one speed, as in the original simulator. *Same so far* knows them: of all",
+        "recorded episodes those that were where the target was seen when it was seen and are still under way, thirty of them",
+        "drawn evenly. Short of reading the trackers' positions no forecast can do better, so that nobody can be farther ahead",
+        "of a rival here than it is.",
+        f"{setup.config.num_windows} windows of {setup.num_episodes} episodes a set (seed {EVALUATION_SEED}), over the map's",
+        "longer side; intervals: 95 %, bootstrap over episodes.", "",
+    ]  # fmt: skip
+    for name in SETS:
+        lines += set_section(name, *rows_of(name, setup), setup.config.seed)
+    return "\n".join(lines).rstrip() + "\n"
+
+
+def main() -> int:
+    """Score what is not kept, and write the page."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--work", type=Path, default=Path("runs/narco_ceiling"))
+    parser.add_argument("--windows", type=int, default=2000)
+    parser.add_argument("--episodes", type=int, default=200, help="to evaluate on")
+    parser.add_argument("--training-episodes", type=int, default=15_000)
+    parser.add_argument("--publish", type=Path, help="folder for narco_ceiling.md; without it the page is printed")
+    args = parser.parse_args()
+    torch.set_num_threads(1)
+    config = ForecastConfig(args.windows, scene=SceneSampling(precision="bfloat16"))
+    setup = Setup(args.work, args.episodes, args.training_episodes, config, Progress())
+    text = page(setup, shlex.join(["python", "benchmarks/narco_ceiling.py", *sys.argv[1:]]))
+    if args.publish is None:
+        print(text)
+    else:
+        write_atomic(args.publish / "narco_ceiling.md", text)
+    return 0
+
+
+if __name__ == "__main__":
+    try:
+        sys.exit(main())
+    except CadenceError as error:
+        sys.exit(f"{error}")
