@@ -1,9 +1,9 @@
 """How good can a forecast in the world narco be?
 
 A smuggler there takes one of sixteen ways, always at the same speed. So what detections and the time say of it can be written
-down: of all recorded episodes those that were where the target was seen, when it was seen, and that are still under way. Thirty
-of them, drawn evenly, are as good as any forecast that does not read the trackers' positions; here they are scored on the
-windows of table I, beside the rivals and CADENCE. Scores are kept under --work: a killed run goes on.
+down: of all recorded episodes those that were where the target was seen, when it was seen, and that are still under way. No
+forecast knows more that does not read the trackers' positions, or what it means not to be seen. Thirty of them, drawn evenly,
+are scored on windows like those of table I, beside the rivals and CADENCE. Scores are kept under --work: a killed run goes on.
 
     python benchmarks/narco_ceiling.py --publish docs/benchmarks
 """
@@ -170,8 +170,8 @@ def page(setup: Setup, command: str) -> str:
         f"`{command}`", "",
         "A smuggler takes one of sixteen ways at one speed, as in the original simulator. *Same so far* knows them: of all",
         "recorded episodes those that were where the target was seen when it was seen and are still under way, thirty of them",
-        "drawn evenly. Short of reading the trackers' positions no forecast can do better, so that nobody can be farther ahead",
-        "of a rival here than it is.",
+        "drawn evenly. No forecast knows more, unless it reads the trackers' positions or what it means not to be seen: its lead",
+        "over a rival is about the most that anybody can have here.",
         f"{setup.config.num_windows} windows of {setup.num_episodes} episodes a set (seed {EVALUATION_SEED}), over the map's",
         "longer side; intervals: 95 %, bootstrap over episodes.", "",
     ]  # fmt: skip

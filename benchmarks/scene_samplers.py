@@ -363,8 +363,9 @@ one thread. Checkpoint: {checkpoint}. Versions: {versions}.
 Speed: hypotheses a second over those of the paper's procedure, median [least, greatest] of {rounds} rounds of {timed}
 windows; a ratio is of processor times of the same round, and all rows run the same network code. The other columns are means
 over the horizons 0, 29, 59, 89 and 119, distances over the map's side. Ratio: energy score over that of DDPM with 100 steps on
-the same windows, with a 95 % interval by bootstrap over episodes. All rows start from the same noise, but those in which every
-second hypothesis begins with the mirror image of the one before. Rows that do not say otherwise are neither guided nor repaired.
+the same windows, with a 95 % interval by bootstrap over episodes. All rows start from the same noise, but those in which
+every second hypothesis begins with the mirror image of the one before. Rows that do not say otherwise are neither guided
+nor repaired.
 
 The paper's procedure: 100 steps of DDPM on the cosine schedule, detections read again for every hypothesis at every step,
 algorithm 1 on every posterior mean (Adam, 8 iterations, learning rate 0.01, through autograd).
