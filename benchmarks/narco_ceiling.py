@@ -170,8 +170,8 @@ def page(setup: Setup, command: str) -> str:
         f"`{command}`", "",
         "A smuggler takes one of sixteen ways at one speed, as in the original simulator. *Same so far* knows them: of all",
         "recorded episodes those that were where the target was seen when it was seen and are still under way, thirty of them",
-        "drawn evenly. No forecast knows more, unless it reads the trackers' positions or what it means not to be seen: its lead",
-        "over a rival is about the most that anybody can have here.",
+        "drawn evenly. No forecast knows more, unless it reads the trackers' positions or what it means not to be seen: its",
+        "lead over a rival is about the most that anybody can have here.",
         f"{setup.config.num_windows} windows of {setup.num_episodes} episodes a set (seed {EVALUATION_SEED}), over the map's",
         "longer side; intervals: 95 %, bootstrap over episodes.", "",
     ]  # fmt: skip
