@@ -65,7 +65,7 @@ def models_of(trained: dict[str, SceneModel]) -> dict[str, SceneModel]:
     found = {
         name: dataclasses.replace(ours, sampling=sampling)
         for name, sampling in {
-            UNGUIDED: PLAIN,
+            UNGUIDED: SceneSampling(guidance="none", is_repaired=False),
             DEFAULT: SceneSampling(),
             GUIDED: SceneSampling(guidance="clean", is_repaired=False),
             BOTH: SceneSampling(guidance="clean"),
