@@ -249,6 +249,8 @@ def page(evaluated: Mapping[str, Evaluated], missing: Sequence[str], command: st
         "each. The true start counts as a detection; after its end a target stays where it was. Distances are over the",
         "map's longer side (2428 cells, 7884 km; the paper does not say what it divides those of narco by). Intervals: 95 %,",
         "bootstrap over episodes. Mixtures are scored by 30 samples and by the paper's measure, which leaves their sigmas out.",
+        "Samples of CADENCE and of the mixtures come in mirrored pairs, the library's evenly along its weights: no lead comes",
+        "from the way of drawing.",
         "A cell is won or lost where the interval of the paired difference does not hold zero. A lead is one minus the ratio",
         "to the rival, or in every cell to the better one of several.", "",
     ]  # fmt: skip
