@@ -184,7 +184,7 @@ def main() -> int:
     """Score what is not kept, and write the page."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--work", type=Path, default=Path("runs/narco_ceiling"))
-    parser.add_argument("--windows", type=int, default=2000)
+    parser.add_argument("--windows", type=int, default=1000)
     parser.add_argument("--episodes", type=int, default=200, help="to evaluate on")
     parser.add_argument("--training-episodes", type=int, default=15_000)
     parser.add_argument("--publish", type=Path, help="folder for narco_ceiling.md; without it the page is printed")
