@@ -219,16 +219,15 @@ def spread_tables(scores: Scores, scale_m: float) -> Iterator[str]:
 
 def budget_table(world: World, scores: Scores, setup: Setup) -> Iterator[str]:
     """What the trainings cost."""
-    yield line(["method", "seed", "steps", "windows", "validation loss", "CPU hours"])
-    yield line(["---"] * 6)
+    yield line(["method", "seed", "steps", "windows", "CPU hours"])
+    yield line(["---"] * 5)
     for method, found in scores.items():
         for seed in found:
             info = read_info(setup.training(method, world, seed) / "checkpoint.safetensors")
             seconds = info.training.get("cpu_seconds")
-            loss = info.scores.get("validation_loss")
             numbers = [f"{value:,}" if value else "–" for value in (info.training.get("steps"), windows_seen(info.training))]
             hours = number(None if seconds is None else seconds / 3600.0, 2)
-            yield line([NAMES[method], str(seed), *numbers, number(loss, 4), hours])
+            yield line([NAMES[method], str(seed), *numbers, hours])
     yield ""
 
 
