@@ -42,6 +42,7 @@ from pipeline.scene import load_scene
 HORIZONS = (0, 29, 59, 89, 119)
 LABELS = ("0", "30", "60", "90", "120")
 NUM_HYPOTHESES = 30
+SAMPLING = SceneSampling(precision="bfloat16")
 APART_M = 4000.0
 SOON_M = 1500.0
 """Agents nearer to a site than this are not shown in the picture: that they meet is no question any more."""
@@ -129,11 +130,12 @@ def held_out(episodes: JointRecordings, num: int, seed: int) -> ForecastWindows:
 def drawn(row: Row, windows: ForecastWindows, episodes: JointRecordings, options: argparse.Namespace) -> HypothesisSet:
     """The row's hypotheses; kept in the work folder, so that a killed run goes on."""
     weights = find_checkpoint(row.checkpoint)
-    key = [row.name, checkpoint_hash(weights), options.windows, options.episodes, options.seed, versions()["cadence"]]
+    asked = (options.windows, options.episodes, options.seed)
+    key = [row.name, checkpoint_hash(weights), asked, SAMPLING, versions()["cadence"]]
     path = options.work / f"{hashlib.sha256(repr(key).encode()).hexdigest()[:16]}.npy"
     if path.is_file():
         return equally_likely(torch.from_numpy(np.load(path)).double())
-    model = load_scene(weights, SceneSampling(precision="bfloat16"))
+    model = load_scene(weights, SAMPLING)
     if row.is_told_apart:
         found = told_apart(model, windows, episodes)
     else:
