@@ -114,17 +114,17 @@ def summary_rows(results: Results, seed: int) -> list[dict[str, Any]]:
             for horizons in (HORIZONS, LATE)
         )
         cells = [verdicts(own, rivals[name], duel.measure, duel.rival_measure, seed) for name in duel.rivals]
-        worst = {key: [_worst(words) for words in zip(*(found[key] for found in cells), strict=True)] for key in own}
-        total = count(worst)
+        verdict = {key: [worst(words) for words in zip(*(found[key] for found in cells), strict=True)] for key in own}
+        total = count(verdict)
         rows.append({
             "against": duel.title, "sets": list(own), "lead": [lead.value, lead.low, lead.high],
             "lead_from_60_min": [late.value, late.low, late.high], "won": total.won, "tied": total.tied, "lost": total.lost,
-            "cells": worst,
+            "cells": verdict,
         })  # fmt: skip
     return rows
 
 
-def _worst(words: Sequence[str]) -> str:
+def worst(words: Sequence[str]) -> str:
     """Against the better of several rivals: won where all are beaten, lost where one is ahead."""
     return "lost" if "lost" in words else "tied" if "tied" in words else "won"
 

@@ -22,7 +22,7 @@ from typing import Literal
 
 import numpy as np
 import torch
-from table1_page import LATE, MINUTES, NAMES, triples
+from table1_page import LATE, MINUTES, NAMES, triples, worst
 
 from cadence.errors import CadenceError
 from cadence.worlds.recordings import Recordings
@@ -161,13 +161,10 @@ def leads(own: EpisodeScores, rivals: Sequence[EpisodeScores], duel: str) -> lis
     """Cells of a row: the mean lead over the better rival, that from 60 min on, and the cells won, tied and lost."""
     cells = []
     for horizons in (HORIZONS, LATE):
-        found = relative_lead(
-            [own], [[rival] for rival in rivals], *DUELS[duel], horizons, BOOTSTRAP_SEED, NUM_RESAMPLES
-        )  # fmt: skip
+        found = relative_lead([own], [[rival] for rival in rivals], *DUELS[duel], horizons, BOOTSTRAP_SEED, NUM_RESAMPLES)
         cells.append(with_interval(100 * found.value, 100 * found.low, 100 * found.high))
     words = [verdicts({"": own}, {"": rival}, *DUELS[duel], BOOTSTRAP_SEED)[""] for rival in rivals]
-    worst = ["lost" if "lost" in both else "tied" if "tied" in both else "won" for both in zip(*words, strict=True)]
-    total = count({"": worst})
+    total = count({"": [worst(both) for both in zip(*words, strict=True)]})
     return [*cells, f"{total.won} / {total.tied} / {total.lost}"]
 
 
@@ -185,13 +182,13 @@ def lead_table(scores: Scores) -> Iterator[str]:
         means = {name: averaged([scores[name][seed] for seed in seeds]) for name in ("cadence", *GRAMMIS)}
         yield line([duel, f"mean of {len(seeds)}", *leads(means["cadence"], [means[name] for name in GRAMMIS], duel)])
     yield ""
+    pairs_of_rivals = [[[scores[name][seed]] for name in GRAMMIS] for seed in seeds]
+    energy = DUELS["energy score"]
     pairs = [
-        relative_lead(
-            [own], [[scores[name][seed]] for name in GRAMMIS], "energy_score", "energy_score", HORIZONS, BOOTSTRAP_SEED, 1
-        ).value
+        relative_lead([own], rival, *energy, HORIZONS, BOOTSTRAP_SEED, 1).value
         for own in scores["cadence"].values()
-        for seed in seeds
-    ]  # fmt: skip
+        for rival in pairs_of_rivals
+    ]
     yield (
         f"Over all {len(pairs)} pairs of a seed of CADENCE with one of the GrAMMIs the mean lead in energy score lies between "
         f"{100 * min(pairs):.1f} and {100 * max(pairs):.1f} %."
