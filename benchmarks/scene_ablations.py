@@ -39,7 +39,7 @@ from pipeline.progress import Progress
 from pipeline.recordings import RecordingsConfig, load_recordings, read_recordings
 from pipeline.scene import load_scene
 from pipeline.train import TrainConfig
-from pipeline.train_scene import SceneTraining, train_scene_network
+from pipeline.train_scene import SceneTraining, train_scene_network, untrained_network
 from pipeline.training_episodes import EpisodePool, EpisodeSource
 
 SETS = ("low", "med", "high")
@@ -164,9 +164,7 @@ def train_config(variant: Variant, setup: Setup, seed: int) -> TrainConfig:
 
 def build(variant: Variant, seed: int) -> SceneNetwork:
     """The untrained network; the true map is fixed in it."""
-    with torch.random.fork_rng(devices=[]):
-        torch.random.manual_seed(seed)
-        network = variant.model.build()
+    network = untrained_network(variant.model, seed)
     if variant.true_map:
         with torch.no_grad():
             network.map.copy_(coverage_cells())

@@ -157,11 +157,9 @@ def set_section(name: str, found_set: Evaluated, seed: int) -> list[str]:
     lines += [*(f"* left out: {reason}" for reason in found_set.left_out), ""] if found_set.left_out else []
     for measure in MEASURES:
         lines += [f"### {TITLES[measure]}: {name}", "", line(["", *MINUTES]), line(["---"] * 6)]
-        unit = 1.0 if measure.startswith("coverage") else scale_m
         for key, found in rows.items():
             if key != "truth":
-                cells = [with_interval(*(value / unit for value in triple)) for triple in triples(found.scores, measure, seed)]
-                lines.append(line([label(key, found), *cells]))
+                lines.append(line([label(key, found), *measure_cells(found.scores, measure, scale_m, seed)]))
         lines.append("")
     lines += [
         f"### Steps and obstacles: {name}",
@@ -174,6 +172,12 @@ def set_section(name: str, found_set: Evaluated, seed: int) -> list[str]:
         step, states, segments = (found.scores.share(item).sum() / total for item in SHARES)
         lines.append(line([label(key, found), number(step), number(100 * states), number(100 * segments)]))
     return [*lines, ""]
+
+
+def measure_cells(scores: EpisodeScores, measure: str, scale_m: float, seed: int) -> list[str]:
+    """A measure at every horizon with its interval, over the map side but for coverages."""
+    unit = 1.0 if measure.startswith("coverage") else scale_m
+    return [with_interval(*(value / unit for value in triple)) for triple in triples(scores, measure, seed)]
 
 
 def triples(scores: EpisodeScores, measure: str, seed: int) -> list[tuple[float, float, float]]:

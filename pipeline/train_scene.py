@@ -82,12 +82,17 @@ def train_scene(out: Path, config: "TrainConfig", progress: Progress, force: boo
         load_pool(sources, cache, model.step_s, "train.scene.model", progress, together)
         for sources in (scene.sources, scene.validation)
     )
-    with torch.random.fork_rng(devices=[]):  # layers take their first weights from the global stream, which is left as it was
-        torch.random.manual_seed(config.seed)
-        network = model.build()
+    network = untrained_network(model, config.seed)
     if scene.start is not None:
         load_weights(find_checkpoint(scene.start), network)
     return train_scene_network(out, config, network, pool, held_out, progress, force)
+
+
+def untrained_network(model: SceneConfig, seed: int) -> SceneNetwork:
+    """The network of a configuration with the first weights that belong to a seed."""
+    with torch.random.fork_rng(devices=[]):  # layers take their first weights from the global stream, which is left as it was
+        torch.random.manual_seed(seed)
+        return model.build()
 
 
 def train_scene_network(

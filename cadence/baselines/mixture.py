@@ -15,6 +15,7 @@ from torch import Tensor
 
 from cadence.bank.rows import scatter_hypotheses
 from cadence.diffusion.absolute import detection_rows
+from cadence.diffusion.noise import mirrored
 from cadence.errors import ConfigError
 from cadence.network.encoder import DetectionEncoder
 from cadence.types import Context, Detections, HypothesisSet, WindowBatch
@@ -79,7 +80,7 @@ class GaussianMixture:
             choice[row] = (order + torch.rand(h, generator=stream, dtype=torch.float64)) / max(num_pairs, 1)
             noise[row] = torch.randn(num_pairs, h, 2, generator=stream, dtype=torch.float64)
         choice = choice.repeat_interleave(2, dim=1)[:, :k]
-        noise = torch.stack([noise, -noise], dim=2).flatten(1, 2)[:, :k]
+        noise = mirrored(noise, k)
         cumulated = self.weight.double().cumsum(dim=-1)
         cumulated = cumulated / cumulated[..., -1:]
         component = (choice[..., None] >= cumulated[:, None, :, :-1]).sum(dim=-1)

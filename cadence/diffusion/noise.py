@@ -21,8 +21,7 @@ class RowNoise:
 
         Few such antithetic draws (Hammersley, Morton, 1956) stand for a distribution better than as many independent ones.
         """
-        half = self.draw(((num_hypotheses + 1) // 2, *shape))
-        return torch.stack([half, -half], dim=2).flatten(1, 2)[:, :num_hypotheses]
+        return mirrored(self.draw(((num_hypotheses + 1) // 2, *shape)), num_hypotheses)
 
     def draw_each(self, num_hypotheses: int, is_used: Tensor) -> Tensor:
         """Standard normal [R, K, N, 2], zero for detections that are not used; left-packed, whatever the padding."""
@@ -30,3 +29,8 @@ class RowNoise:
         for row, (generator, count) in enumerate(zip(self.generators, is_used.sum(dim=1).tolist(), strict=True)):
             noise[row, :, :count] = torch.randn(num_hypotheses, count, 2, generator=generator)
         return noise
+
+
+def mirrored(noise: Tensor, num_draws: int) -> Tensor:
+    """Noise [R, N, ...], each draw followed by its mirror image: [R, K, ...] for a number of draws K of at most 2 N."""
+    return torch.stack([noise, -noise], dim=2).flatten(1, 2)[:, :num_draws]
