@@ -9,11 +9,11 @@ from typing import Annotated, Literal
 import typer
 
 from cadence.errors import CadenceError, UsageError
+from pipeline.batch.summaries import batch_summary, log_record, stage_summary, to_json
 from pipeline.config import stage_config
 from pipeline.manifest import StageResult
 from pipeline.missions import mission_directories
 from pipeline.progress import Progress
-from pipeline.summaries import batch_summary, log_record, stage_summary, to_json
 
 EXIT_INTERRUPTED = 130
 _COMBINED = ["export.combined=true"]
@@ -92,7 +92,7 @@ def info(log: Log, as_json: Json = False) -> None:
       cadence info flight.mcap
       cadence info flight.mcap --json
     """
-    from pipeline.info import describe_log, render
+    from pipeline.inspect.info import describe_log, render
 
     description = describe_log(log)
     typer.echo(to_json(description) if as_json else render(description))
@@ -110,7 +110,7 @@ def doctor(logs: Logs, quiet: Quiet = False, as_json: Json = False) -> int:
       cadence doctor flight.mcap
       cadence doctor logs --json
     """
-    from pipeline.doctor import diagnose_all, exit_code, render
+    from pipeline.inspect.doctor import diagnose_all, exit_code, render
 
     found = diagnose_all(logs, Progress(quiet))
     typer.echo(to_json(found) if as_json else "\n\n".join(map(render, found)))
@@ -138,9 +138,9 @@ def run(
       cadence run s3://fleet/2026-11 --out s3://fleet/tracks --engine ray
       cadence run flight.mcap --out results --set infer.num_hypotheses=50 --seed 7
     """
-    from pipeline.batch import RunConfig, complaints, exit_code
-    from pipeline.run import run as run_all
-    from pipeline.run import selection_settings
+    from pipeline.batch.run import run as run_all
+    from pipeline.batch.run import selection_settings
+    from pipeline.batch.tasks import RunConfig, complaints, exit_code
 
     chosen = [*(settings or ()), *_COMBINED * combined, *selection_settings(start, end, topic or ())]
     resolved = stage_config(RunConfig, None, config, chosen, seed)
@@ -164,8 +164,8 @@ def ingest(
     Example:
       cadence ingest flight.mcap --out results
     """
-    from pipeline.ingest import IngestConfig
-    from pipeline.ingest import ingest as stage
+    from pipeline.ingest.stage import IngestConfig
+    from pipeline.ingest.stage import ingest as stage
 
     directory = mission_directories([log], out)[log]
     _show(stage(log, directory, stage_config(IngestConfig, "ingest", config, settings or ()), Progress(quiet), force), as_json)
@@ -185,8 +185,8 @@ def extract(
       cadence extract results/flight
       cadence extract results/flight --config mapping.toml --force
     """
-    from pipeline.extract import ExtractConfig
-    from pipeline.extract import extract as stage
+    from pipeline.extract.stage import ExtractConfig
+    from pipeline.extract.stage import extract as stage
 
     _show(stage(mission, stage_config(ExtractConfig, "extract", config, settings or (), seed), Progress(quiet), force), as_json)
 
@@ -202,8 +202,8 @@ def infer(
     Example:
       cadence infer results/flight --set infer.num_hypotheses=50 --seed 7
     """
-    from pipeline.infer import InferConfig
-    from pipeline.infer import infer as stage
+    from pipeline.infer.stage import InferConfig
+    from pipeline.infer.stage import infer as stage
 
     _show(stage(mission, stage_config(InferConfig, "infer", config, settings or (), seed), Progress(quiet), force), as_json)
 
@@ -221,8 +221,8 @@ def export(
     Example:
       cadence export results/flight --combined
     """
-    from pipeline.export import ExportConfig
-    from pipeline.export import export as stage
+    from pipeline.export.stage import ExportConfig
+    from pipeline.export.stage import export as stage
 
     resolved = stage_config(ExportConfig, "export", config, [*(settings or ()), *_COMBINED * combined])
     _show(stage(mission, resolved, Progress(quiet), force), as_json)
@@ -239,8 +239,8 @@ def report(
     Example:
       cadence report results/flight
     """
-    from pipeline.report import ReportConfig
-    from pipeline.report import report as stage
+    from pipeline.report.stage import ReportConfig
+    from pipeline.report.stage import report as stage
 
     _show(stage(mission, stage_config(ReportConfig, "report", config, settings or ()), Progress(quiet), force), as_json)
 
@@ -259,7 +259,7 @@ def evaluate(
       cadence evaluate results/flight
       cadence evaluate logs --checkpoint prison --out scores
     """
-    from pipeline.evaluate import EvaluateConfig, evaluate_any
+    from pipeline.evaluate.stage import EvaluateConfig, evaluate_any
 
     resolved = stage_config(EvaluateConfig, "evaluate", config, settings or (), seed)
     _show(evaluate_any(mission, checkpoint, out, resolved, Progress(quiet), force), as_json)
@@ -280,8 +280,8 @@ def simulate(
       cadence simulate --out logs --set simulate.num_episodes=20 --set simulate.patrol.detection_rate=0.12
       cadence simulate --out logs --set simulate.world=prison --set simulate.prison.set=high
     """
-    from pipeline.simulate import SimulateConfig
-    from pipeline.simulate import simulate as stage
+    from pipeline.simulate.stage import SimulateConfig
+    from pipeline.simulate.stage import simulate as stage
 
     _show(stage(out, stage_config(SimulateConfig, "simulate", config, settings or (), seed), Progress(quiet), force), as_json)
 
@@ -300,8 +300,8 @@ def train(
       cadence train --out runs/general --seed 1
       cadence train --out runs/ships --config ships.toml
     """
-    from pipeline.train import TrainConfig
-    from pipeline.train import train as stage
+    from pipeline.train.stage import TrainConfig
+    from pipeline.train.stage import train as stage
 
     _show(stage(out, stage_config(TrainConfig, "train", config, settings or (), seed), Progress(quiet), force), as_json)
 

@@ -81,8 +81,8 @@ def rendezvous_logs(seed: int, number: int) -> list[Log]:
 
 def ship_log() -> Log:
     """The real log, read by the pipeline; truth between reports at most two minutes apart; the first quarter is for tuning."""
-    from pipeline.extract import ExtractConfig, extract
-    from pipeline.ingest import IngestConfig, ingest
+    from pipeline.extract.stage import ExtractConfig, extract
+    from pipeline.ingest.stage import IngestConfig, ingest
     from pipeline.progress import Progress
     from pipeline.tables import read_table
 

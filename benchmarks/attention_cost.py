@@ -19,8 +19,8 @@ from cadence.diffusion.scene import SceneModel
 from cadence.worlds.recordings import ForecastWindows, cut_windows
 from cadence.worlds.rendezvous import RendezvousConfig, simulate_rendezvous_batch
 from pipeline.checkpoints import find_checkpoint
+from pipeline.estimators.scene import load_scene
 from pipeline.manifest import write_atomic
-from pipeline.scene import load_scene
 
 AGENTS = (1, 2, 4, 8, 16, 32)
 NUM_HYPOTHESES = 30

@@ -17,15 +17,15 @@ from pathlib import Path
 import torch
 
 from cadence.constraints.obstacles import Obstacles
-from pipeline.batch import RunConfig
+from pipeline.batch.run import run
+from pipeline.batch.tasks import RunConfig
 from pipeline.checkpoints import checkpoint_hash, find_checkpoint
 from pipeline.config import stage_config
+from pipeline.estimators.scene import load_scene, scene_context, scene_grid
 from pipeline.manifest import hash_file, write_atomic
 from pipeline.progress import Progress
 from pipeline.provenance import versions
-from pipeline.run import run
-from pipeline.scene import load_scene, scene_context, scene_grid
-from pipeline.simulate import SimulateConfig, simulate
+from pipeline.simulate.stage import SimulateConfig, simulate
 from pipeline.tables import read_table
 from pipeline.windows import build_windows, plan_grid
 

@@ -13,13 +13,13 @@ import tempfile
 import time
 from pathlib import Path
 
-from pipeline.batch import LogOutcome, RunConfig, exit_code
+from pipeline.batch.run import run
+from pipeline.batch.tasks import LogOutcome, RunConfig, exit_code
 from pipeline.config import stage_config
 from pipeline.manifest import hash_file, write_atomic
 from pipeline.progress import Progress
 from pipeline.provenance import versions
-from pipeline.run import run
-from pipeline.simulate import SimulateConfig, simulate
+from pipeline.simulate.stage import SimulateConfig, simulate
 
 QUIET = Progress(quiet=True)
 SEED = 7

@@ -24,12 +24,12 @@ from cadence.network.trajectory import TrajectoryNetworkConfig
 from cadence.training.loop import OptimiserConfig
 from cadence.types import Context
 from cadence.worlds.patrol import PatrolConfig, simulate_patrol
-from pipeline.absolute import load_absolute
+from pipeline.estimators.paper import load_absolute
 from pipeline.manifest import write_atomic
 from pipeline.progress import Progress
-from pipeline.train import TrainConfig, train
-from pipeline.train_absolute import AbsoluteTraining, draw_windows
-from pipeline.training_tables import mission_of_episode
+from pipeline.train.missions import mission_of_episode
+from pipeline.train.paper import AbsoluteTraining, draw_windows
+from pipeline.train.stage import TrainConfig, train
 
 WORK = Path("out/benchmarks/inpainting_jumps")
 TEST_SEED = 900_001

@@ -22,16 +22,16 @@ from cadence.constraints.obstacles import Obstacles
 from cadence.diffusion.scene import SceneSampling
 from cadence.types import Context, HypothesisSet, WindowBatch
 from pipeline.checkpoints import checkpoint_hash, find_checkpoint
-from pipeline.forecast_leads import relative_lead
-from pipeline.forecast_scores import HORIZONS, EpisodeScores
-from pipeline.forecast_tables import line, mean_interval, number, with_interval
-from pipeline.forecasters import FORECAST_RIVALS
-from pipeline.forecasts import ForecastConfig, ForecastRun, forecast_windows
+from pipeline.episodes.recordings import RecordingsConfig, RecordingSet, load_recordings
+from pipeline.estimators.scene import load_scene
+from pipeline.forecast.forecasters import FORECAST_RIVALS
+from pipeline.forecast.leads import relative_lead
+from pipeline.forecast.scores import HORIZONS, EpisodeScores
+from pipeline.forecast.stage import ForecastConfig, ForecastRun, forecast_windows
+from pipeline.forecast.tables import line, mean_interval, number, with_interval
+from pipeline.infer.placed_draws import Forecaster
 from pipeline.manifest import write_atomic
-from pipeline.placed_draws import Forecaster
 from pipeline.progress import Progress
-from pipeline.recordings import RecordingsConfig, RecordingSet, load_recordings
-from pipeline.scene import load_scene
 
 FIRST_TRACK = 500
 """Narco's checkpoint was chosen on the episodes before it, which are evaluated on here."""

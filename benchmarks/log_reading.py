@@ -116,13 +116,13 @@ def theirs(path: Path) -> dict[str, Callable[[], int]]:
 
 def ours(path: Path) -> dict[str, tuple[str, Callable[[], int]]]:
     """What we are asked to do, and to which of `theirs` it is compared."""
+    from pipeline.extract.positions import ChannelReader
+    from pipeline.extract.reading import read_positions
     from pipeline.logs.cdr_fields import CdrFields
     from pipeline.logs.decode import decoder_for
     from pipeline.logs.reader import MissionLog, open_log, reopen
-    from pipeline.position_reading import read_positions
-    from pipeline.positions import ChannelReader
+    from pipeline.mapping.sources import SourceConfig
     from pipeline.progress import Progress
-    from pipeline.sources import SourceConfig
 
     checked = open_log(path)
     channel = next(channel for channel in checked.channels if channel.topic == TOPIC)

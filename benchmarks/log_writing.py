@@ -27,10 +27,10 @@ from mcap.writer import CompressionType, Writer
 from pipeline.export.display import Style, draw, scene_entities
 from pipeline.export.messages import encode_agents, encode_hypotheses
 from pipeline.export.playback import Scene, build_scenes, plan_ticks
+from pipeline.export.scene import Entity, encode_scene
 from pipeline.export.stage import ExportConfig, num_vertices
 from pipeline.logs.append import write_combined
 from pipeline.logs.recorder import Packing
-from pipeline.logs.scene import Entity, encode_scene
 from pipeline.logs.writer import LogWriter, schema_bytes
 from pipeline.manifest import write_atomic
 from pipeline.progress import Progress

@@ -18,7 +18,7 @@ DATA = Path(__file__).resolve().parents[1].parent / "shared" / "data"
 LIMIT_GB = 1.5
 _UNIT = 1024 if sys.platform.startswith("linux") else 1
 _COMMAND = "import sys, cli; sys.exit(cli.main())"
-_IMPORTS = "import pipeline.run"
+_IMPORTS = "import pipeline.batch.run"
 
 
 @dataclass(frozen=True)

@@ -29,15 +29,15 @@ from cadence.errors import CadenceError
 from cadence.types import Context, Detections, HypothesisSet, WindowBatch
 from cadence.worlds.recordings import Recordings
 from pipeline.checkpoints import checkpoint_hash, find_checkpoint
-from pipeline.forecast_leads import relative_lead
-from pipeline.forecast_scores import HORIZONS, EpisodeScores
-from pipeline.forecast_tables import TITLES, line, with_interval
-from pipeline.forecasters import FORECAST_RIVALS, Samplings, Unguided, load_forecaster
-from pipeline.forecasts import ForecastConfig, ForecastRun, forecast_windows
+from pipeline.episodes.recordings import RecordingsConfig, load_recordings
+from pipeline.forecast.forecasters import FORECAST_RIVALS, Samplings, Unguided, load_forecaster
+from pipeline.forecast.leads import relative_lead
+from pipeline.forecast.scores import HORIZONS, EpisodeScores
+from pipeline.forecast.stage import ForecastConfig, ForecastRun, forecast_windows
+from pipeline.forecast.tables import TITLES, line, with_interval
+from pipeline.infer.placed_draws import Forecaster
 from pipeline.manifest import write_atomic
-from pipeline.placed_draws import Forecaster
 from pipeline.progress import Progress
-from pipeline.recordings import RecordingsConfig, load_recordings
 
 SETS = ("low", "high")
 TRAINING_SEED = 1

@@ -20,17 +20,17 @@ from cadence.errors import CadenceError
 from cadence.metrics import Interval, bootstrap_ratio
 from cadence.types import Estimator
 from pipeline.checkpoints import DEFAULT, find_checkpoint
-from pipeline.evaluate import default_truth_gap_s
-from pipeline.extract import ExtractConfig, extract
-from pipeline.infer import InferConfig, fitted_model
-from pipeline.ingest import IngestConfig, ingest
+from pipeline.evaluate.rivals import RIVALS, FittingData
+from pipeline.evaluate.scores import METRICS, PARTS, Cells, compare, groups_of
+from pipeline.evaluate.stage import default_truth_gap_s
+from pipeline.extract.stage import ExtractConfig, extract
+from pipeline.extract.thinning import ThinningConfig
+from pipeline.infer.stage import InferConfig, fitted_model
+from pipeline.ingest.stage import IngestConfig, ingest
 from pipeline.manifest import write_atomic
+from pipeline.mapping.sources import SourceConfig
 from pipeline.progress import Progress
-from pipeline.rivals import RIVALS, FittingData
-from pipeline.scores import METRICS, PARTS, Cells, compare, groups_of
-from pipeline.sources import SourceConfig
 from pipeline.tables import read_table
-from pipeline.thinning import ThinningConfig
 from pipeline.windows import GridConfig, MissionWindows, build_windows, plan_grid, truth_on_grid
 
 DATA = Path(__file__).resolve().parents[1].parent / "shared" / "data"

@@ -35,9 +35,9 @@ from cadence.worlds.recordings import ForecastWindows, choose_windows, cut_windo
 from cadence.worlds.rendezvous import RendezvousConfig, simulate_rendezvous, simulate_rendezvous_batch
 from cadence.worlds.rendezvous_map import GOALS_M, SITES_M
 from pipeline.checkpoints import checkpoint_hash, find_checkpoint
+from pipeline.estimators.scene import load_scene
 from pipeline.manifest import write_atomic
 from pipeline.provenance import versions
-from pipeline.scene import load_scene
 
 HORIZONS = (0, 29, 59, 89, 119)
 LABELS = ("0", "30", "60", "90", "120")

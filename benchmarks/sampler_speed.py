@@ -38,10 +38,10 @@ from cadence.types import HypothesisSet
 from cadence.worlds.episode import Episode
 from cadence.worlds.patrol import PatrolConfig, simulate_patrol
 from pipeline.checkpoints import checkpoint_hash, find_checkpoint
-from pipeline.infer import InferConfig, draw_hypotheses, fitted_model
+from pipeline.infer.stage import InferConfig, draw_hypotheses, fitted_model
 from pipeline.manifest import write_atomic
 from pipeline.provenance import versions
-from pipeline.training_tables import mission_of_episode
+from pipeline.train.missions import mission_of_episode
 from pipeline.windows import GridConfig, MissionWindows, build_windows, plan_grid, truth_on_grid
 
 NUM_STEPS, ITERATIONS, LEARNING_RATE = 100, 8, 1e-2

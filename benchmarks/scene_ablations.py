@@ -30,17 +30,17 @@ from cadence.training.loop import OptimiserConfig
 from cadence.worlds.prison_map import SIDE, prison_map
 from cadence.worlds.recordings import Recordings
 from pipeline.checkpoints import checkpoint_hash, read_info
-from pipeline.forecast_leads import averaged, relative_lead
-from pipeline.forecast_scores import HORIZONS, EpisodeScores
-from pipeline.forecast_tables import comparison, line, mean_interval, number, with_interval
-from pipeline.forecasts import ForecastConfig, ForecastRun, forecast_windows
+from pipeline.episodes.pool import EpisodePool, EpisodeSource
+from pipeline.episodes.recordings import RecordingsConfig, load_recordings, read_recordings
+from pipeline.estimators.scene import load_scene
+from pipeline.forecast.leads import averaged, relative_lead
+from pipeline.forecast.scores import HORIZONS, EpisodeScores
+from pipeline.forecast.stage import ForecastConfig, ForecastRun, forecast_windows
+from pipeline.forecast.tables import comparison, line, mean_interval, number, with_interval
 from pipeline.manifest import write_atomic
 from pipeline.progress import Progress
-from pipeline.recordings import RecordingsConfig, load_recordings, read_recordings
-from pipeline.scene import load_scene
-from pipeline.train import TrainConfig
-from pipeline.train_scene import SceneTraining, train_scene_network, untrained_network
-from pipeline.training_episodes import EpisodePool, EpisodeSource
+from pipeline.train.scene import SceneTraining, train_scene_network, untrained_network
+from pipeline.train.stage import TrainConfig
 
 SETS = ("low", "med", "high")
 KINDS = ("simulated", "original")

@@ -45,7 +45,7 @@ from cadence.diffusion.scene import SceneModel, SceneSampling
 from cadence.metrics import Interval, bootstrap_ratio
 from cadence.worlds import prison_map
 from cadence.worlds.recordings import ForecastWindows, Recordings, choose_windows
-from pipeline.forecast_scores import EpisodeScores
+from pipeline.forecast.scores import EpisodeScores
 from pipeline.manifest import write_atomic
 
 NEAR_CELLS = 250.0

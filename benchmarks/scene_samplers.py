@@ -28,12 +28,12 @@ from cadence.types import HypothesisSet
 from cadence.worlds import prison_map
 from cadence.worlds.recordings import ForecastWindows, Recordings, choose_windows, cut_windows
 from pipeline.checkpoints import checkpoint_hash, find_checkpoint
-from pipeline.forecast_scores import HORIZONS, EpisodeScores, score_forecasts, step_quantiles
+from pipeline.episodes.recordings import RecordingsConfig, load_recordings
+from pipeline.estimators.scene import load_scene
+from pipeline.forecast.scores import HORIZONS, EpisodeScores, score_forecasts, step_quantiles
 from pipeline.manifest import write_atomic
 from pipeline.progress import Progress
 from pipeline.provenance import versions
-from pipeline.recordings import RecordingsConfig, load_recordings
-from pipeline.scene import load_scene
 
 DATA = Path(__file__).resolve().parents[1].parent / "shared" / "data" / "prison_reference"
 SETS = ("low", "med", "high")

@@ -1,7 +1,7 @@
 """The paper's table I again: who forecasts best, on our five sets of simulated episodes and on recorded ones?
 
 Evaluation episodes with a seed of their own (fifty a set unless --episodes says more), 2000 random windows, 30 hypotheses,
-errors at 0/30/60/90/120 min over the map side (`pipeline.forecasts`). Learned methods are checkpoints that are found by name in
+errors at 0/30/60/90/120 min over the map side (`pipeline.forecast`). Learned methods are checkpoints that are found by name in
 --checkpoints (below); what is not found is named on the page and left out. Scores are kept in blocks of windows under --work: a
 killed run goes on.
 
@@ -36,13 +36,13 @@ from cadence.errors import CadenceError, InputError
 from cadence.worlds.recordings import Recordings
 from pipeline.checkpoints import checkpoint_hash, find_checkpoint, read_info, windows_seen
 from pipeline.config import config_as_dict
-from pipeline.forecast_leads import averaged
-from pipeline.forecasters import FORECAST_RIVALS, Samplings, load_forecaster
-from pipeline.forecasts import ForecastConfig, ForecastRun, forecast_windows, truth_scores
+from pipeline.episodes.recordings import RecordingsConfig, load_recordings
+from pipeline.forecast.forecasters import FORECAST_RIVALS, Samplings, load_forecaster
+from pipeline.forecast.leads import averaged
+from pipeline.forecast.stage import ForecastConfig, ForecastRun, forecast_windows, truth_scores
+from pipeline.infer.placed_draws import Forecaster
 from pipeline.manifest import write_atomic
-from pipeline.placed_draws import Forecaster
 from pipeline.progress import Progress
-from pipeline.recordings import RecordingsConfig, load_recordings
 
 EVALUATION_SEED, TRAINING_SEED = 2_000, 0
 LEARNED = (*MIXTURES, "paper", "cadence")

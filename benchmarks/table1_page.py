@@ -5,10 +5,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from pipeline.forecast_leads import count, relative_lead, verdicts
-from pipeline.forecast_scores import HORIZONS, MEASURES, SHARES, EpisodeScores
-from pipeline.forecast_tables import TITLES, line, mean_interval, number, with_interval
-from pipeline.forecasts import ForecastConfig
+from pipeline.forecast.leads import count, relative_lead, verdicts
+from pipeline.forecast.scores import HORIZONS, MEASURES, SHARES, EpisodeScores
+from pipeline.forecast.stage import ForecastConfig
+from pipeline.forecast.tables import TITLES, line, mean_interval, number, with_interval
 
 MIXTURES = ("vrnn", "grammi_without_mi", "grammi")
 MINUTES = ("0", "30", "60", "90", "120 min")

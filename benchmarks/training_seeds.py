@@ -28,18 +28,18 @@ from cadence.errors import CadenceError
 from cadence.worlds.recordings import Recordings
 from pipeline.checkpoints import checkpoint_hash, read_info, windows_seen
 from pipeline.config import stage_config
-from pipeline.forecast_leads import averaged, count, relative_lead, verdicts
-from pipeline.forecast_scores import HORIZONS, EpisodeScores
-from pipeline.forecast_tables import TITLES, line, number, with_interval
-from pipeline.forecasters import Samplings, load_forecaster
-from pipeline.forecasts import ForecastConfig, ForecastRun, forecast_windows
+from pipeline.episodes.pool import EpisodePool, EpisodeSource
+from pipeline.episodes.recordings import RecordingsConfig, load_recordings
+from pipeline.forecast.forecasters import Samplings, load_forecaster
+from pipeline.forecast.leads import averaged, count, relative_lead, verdicts
+from pipeline.forecast.scores import HORIZONS, EpisodeScores
+from pipeline.forecast.stage import ForecastConfig, ForecastRun, forecast_windows
+from pipeline.forecast.tables import TITLES, line, number, with_interval
 from pipeline.manifest import write_atomic
 from pipeline.progress import Progress
-from pipeline.recordings import RecordingsConfig, load_recordings
-from pipeline.train import TrainConfig
-from pipeline.train_rivals import train_rival
-from pipeline.train_scene import train_scene_network, untrained_network
-from pipeline.training_episodes import EpisodePool, EpisodeSource
+from pipeline.train.rivals import train_rival
+from pipeline.train.scene import train_scene_network, untrained_network
+from pipeline.train.stage import TrainConfig
 
 World = Literal["prison", "narco"]
 WORLDS: tuple[World, ...] = ("prison", "narco")

@@ -19,8 +19,8 @@ from cadence.worlds.draws import Draws
 from cadence.worlds.prison_fugitive import Fugitives, Sight, stride
 from cadence.worlds.recordings import Recordings
 from cadence.worlds.statistics import EpisodeStatistics, compare, episode_statistics, site_difference
+from pipeline.episodes.recordings import RecordingsConfig, load_recordings
 from pipeline.progress import Progress
-from pipeline.recordings import RecordingsConfig, load_recordings
 
 KEPT = Path(__file__).resolve().parents[1] / "tests" / "cadence" / "prison_reference.json"
 REFERENCE_FACTORS = {"low": 3.5, "med": 6.4, "high": 8.3}

@@ -21,7 +21,7 @@ import typer.testing
 
 import cli
 from pipeline.config import TABLES
-from pipeline.presets import PRESETS
+from pipeline.mapping.presets import PRESETS
 
 COMMANDS = ("info", "doctor", "run", "ingest", "extract", "infer", "export", "report", "evaluate", "simulate", "train")
 
@@ -83,7 +83,7 @@ def configuration_page() -> str:
 
 def stage_config_class(table: str) -> type[Any]:
     """The configuration dataclass behind a table of the file."""
-    return typing.cast(type[Any], getattr(importlib.import_module(f"pipeline.{table}"), f"{table.capitalize()}Config"))
+    return typing.cast(type[Any], getattr(importlib.import_module(f"pipeline.{table}.stage"), f"{table.capitalize()}Config"))
 
 
 def meanings(cls: type[Any]) -> dict[str, str]:

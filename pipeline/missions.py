@@ -12,8 +12,8 @@ from typing import Final
 
 from cadence.errors import CadenceError, InputError, UsageError
 from pipeline.logs.parts import METADATA_NAME, group_parts, mission_name, named_parts
-from pipeline.storage import StoredObject, find_objects, read_bytes
-from pipeline.urls import is_url, shown, url_name
+from pipeline.stores.objects import StoredObject, find_objects, read_bytes
+from pipeline.stores.urls import is_url, shown, url_name
 
 _OWN_ENDINGS: Final = (".cadence.mcap", ".combined.mcap")
 

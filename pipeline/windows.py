@@ -21,7 +21,7 @@ from cadence.types import Detections, WindowBatch
 
 UNKNOWN_AGENT = "unknown"
 """Name of the one agent that detections of unknown origin are taken to belong to where they are not told apart
-(`pipeline.association` does that)."""
+(`pipeline.infer.ways` does that)."""
 
 _NICE = np.array([1.0, 1.2, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0])
 _STEPS_PER_GAP = 16.0

@@ -67,7 +67,7 @@ def test_what_is_exported_can_be_imported():
 
 @pytest.mark.parametrize("stage", ["ingest", "extract", "infer", "export", "report", "evaluate"])
 def test_every_stage_has_the_same_shape(stage):
-    module = importlib.import_module(f"pipeline.{stage}")
+    module = importlib.import_module(f"pipeline.{stage}.stage")
     parameters = list(inspect.signature(getattr(module, stage)).parameters.values())
     wanted = ["directory", "config", "progress", "force"]
     assert [parameter.name for parameter in parameters] == (["log", *wanted] if stage == "ingest" else wanted)

@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 
 import pytest
-from logs_fixture import Fix, straight_line, write_log
+from fixtures.line_logs import Fix, straight_line, write_log
 
 import cli
 

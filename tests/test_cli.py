@@ -67,7 +67,7 @@ def test_wrong_call_is_one_line_and_exit_code_2(arguments, says, capsys):
 @pytest.fixture
 def fake_infer(monkeypatch):
     """`cadence infer` with a stage that does what `behaviour` says; returns the list of its calls."""
-    import pipeline.infer
+    import pipeline.infer.stage
 
     calls = []
 
@@ -76,7 +76,7 @@ def fake_infer(monkeypatch):
             calls.append((directory, config, progress, force))
             return behaviour()
 
-        monkeypatch.setattr(pipeline.infer, "infer", stage)
+        monkeypatch.setattr(pipeline.infer.stage, "infer", stage)
         return calls
 
     return install
@@ -111,13 +111,13 @@ def test_flags_reach_the_stage(fake_infer, tmp_path):
 
 
 def test_combined_is_a_setting_of_export(monkeypatch):
-    import pipeline.export
-    import pipeline.run
+    import pipeline.batch.run
+    import pipeline.export.stage
 
     found = []
-    monkeypatch.setattr(pipeline.run, "run", lambda logs, out, config, *_: found.append(config.export.combined) or ())
+    monkeypatch.setattr(pipeline.batch.run, "run", lambda logs, out, config, *_: found.append(config.export.combined) or ())
     monkeypatch.setattr(
-        pipeline.export,
+        pipeline.export.stage,
         "export",
         lambda mission, config, *_: found.append(config.combined) or StageResult("export", "done", (), {}),
     )
@@ -168,7 +168,7 @@ def test_seed_has_a_meaning_wherever_it_is_offered(command):
 
     from pipeline.config import with_seed
 
-    config = getattr(importlib.import_module(f"pipeline.{command}"), f"{command.capitalize()}Config")()
+    config = getattr(importlib.import_module(f"pipeline.{command}.stage"), f"{command.capitalize()}Config")()
     assert with_seed(config, 123_456) != config
 
 

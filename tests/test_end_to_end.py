@@ -5,7 +5,7 @@ from collections import Counter
 from pathlib import Path
 
 import pytest
-from logs_fixture import straight_line, write_log
+from fixtures.line_logs import straight_line, write_log
 from mcap.reader import make_reader
 
 import cli

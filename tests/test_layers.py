@@ -42,8 +42,8 @@ MAX_FILE_LINES = 400
 MAX_FUNCTION_LINES = 60
 LONG_FILES: dict[str, str] = {}  # path: the reason why it is one file
 GLOBAL_SEEDS = {  # path: the reason why it may seed the global generator
-    "pipeline/train.py": "torch draws initial weights from no other",
-    "pipeline/train_absolute.py": "torch draws initial weights from no other",
+    "pipeline/train/stage.py": "torch draws initial weights from no other",
+    "pipeline/train/paper.py": "torch draws initial weights from no other",
 }
 LONG_FUNCTIONS: dict[str, str] = {}  # path::function: the reason why it is one function
 

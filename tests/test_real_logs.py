@@ -7,7 +7,7 @@ import pytest
 from benchmarks import real_logs
 from benchmarks.real_logs import Result, as_markdown, as_text, draw_chart, table
 from cadence.errors import CadenceError
-from pipeline.scores import METRICS, PARTS
+from pipeline.evaluate.scores import METRICS, PARTS
 
 
 def result(estimator: str, seed: int, energy: float, groups: tuple[str, ...] = ("a", "b", "c"), rate: float = 0.05) -> Result:

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.export.playback import LiveAgent, Scene
-from pipeline.logs.scene import Entity, Label, Lines, LineType, Spheres, round_positions
+from pipeline.export.scene import Entity, Label, Lines, LineType, Spheres, round_positions
 
 Float64s = npt.NDArray[np.float64]
 

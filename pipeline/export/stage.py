@@ -15,12 +15,12 @@ from cadence.errors import InputError
 from pipeline.config import config_as_dict
 from pipeline.export import maps, messages
 from pipeline.export.display import Drawing, Marks, Style, draw, obstacle_entities, scene_entities
+from pipeline.export.layouts import build_layout, build_legacy_layout
 from pipeline.export.playback import Scene, Tick, build_scenes, plan_ticks
-from pipeline.ingest import CATALOGUE_NAME, Catalogue, read_catalogue
-from pipeline.layouts import build_layout, build_legacy_layout
+from pipeline.export.scene import encode_scene
+from pipeline.ingest.stage import CATALOGUE_NAME, Catalogue, read_catalogue
 from pipeline.logs.append import write_combined
 from pipeline.logs.recorder import Compression, Packing
-from pipeline.logs.scene import encode_scene
 from pipeline.logs.writer import LogWriter
 from pipeline.manifest import StageResult, hash_file, manifest_path, read_manifest, run_stage
 from pipeline.progress import Progress

@@ -19,7 +19,7 @@ from pipeline.checkpoints import (
     save_checkpoint,
 )
 from pipeline.config import config_as_dict
-from pipeline.infer import InferConfig, load_model
+from pipeline.infer.stage import InferConfig, load_model
 
 SMALL = ResidualNetworkConfig(width=8, multipliers=(1, 2), encoder_size=8, level_size=8)
 INFO = CheckpointInfo("general", config_as_dict(SMALL), {"steps": 3}, {"validation_loss": 0.5})

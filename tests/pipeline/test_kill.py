@@ -11,7 +11,7 @@ import time
 from pathlib import Path
 
 import pytest
-from batch_fixture import hidden_in, processes_of, results_of, start, start_command, write_tiny_logs
+from fixtures.batch import hidden_in, processes_of, results_of, start, start_command, write_tiny_logs
 
 from pipeline.locks import locked
 from pipeline.manifest import hash_file

@@ -1,0 +1,1 @@
+"""Many missions: tasks, engines that run them, and what became of each."""

@@ -1,0 +1,159 @@
+"""`cadence run`: plan a batch, run it, report it. One bad log never stops the others, and what is done already is skipped."""
+
+import contextlib
+import json
+import os
+import signal
+import threading
+import time
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from functools import partial
+from pathlib import Path
+from types import FrameType
+from typing import Literal
+
+from tqdm import tqdm
+
+from cadence.errors import CadenceError, UsageError
+from pipeline.batch.engines.local import run_in_processes, run_in_sequence
+from pipeline.batch.engines.ray import run_on_ray
+from pipeline.batch.remote import SOURCE_NAME, run_anywhere, write_text
+from pipeline.batch.summaries import batch_record, to_json
+from pipeline.batch.tasks import STAGES, Engine, LogOutcome, LogTask, RunConfig, exit_code, plan_tasks, run_tasks
+from pipeline.ingest.stage import CATALOGUE_NAME, Catalogue, read_catalogue
+from pipeline.manifest import hash_file, manifest_path
+from pipeline.progress import Progress, Told
+from pipeline.stores.urls import is_url
+
+REPORT_NAME = "batch.json"
+_WORKER_BYTES = 2_000_000_000
+_MEMINFO = Path("/proc/meminfo")
+
+EngineName = Literal["local", "ray"]
+
+
+def run(
+    logs: Sequence[str], out: str, config: RunConfig, progress: Progress, force: bool = False,
+    engine: EngineName = "local", num_workers: int | None = None, report: Path | None = None,
+) -> tuple[LogOutcome, ...]:  # fmt: skip
+    """Run all stages on every mission among `logs`, each in its own mission directory under `out`; outcomes in their order.
+
+    Writes `out`/batch.json, and the same to `report`. `num_workers`: processes; 0 runs in this one; None chooses.
+    Raises `UsageError` or `InputError` where there is no log at all.
+    """
+    started_s = time.monotonic()
+    out = out.removeprefix("file://").rstrip("/") or "/"
+    tasks = plan_tasks(logs, out, config, force)
+    chosen = choose_engine(engine, len(tasks), num_workers)
+    if len(tasks) > 1:
+        progress.note(_plan_line(tasks))
+    for line in _renamed(tasks, out):
+        progress.note(line)
+    with _interruptible(), contextlib.closing(_Shown(tasks, progress)) as shown:
+        outcomes = run_tasks(tasks, chosen, shown.finished, shown.watch, run_anywhere)
+    text = to_json(batch_record(outcomes, exit_code(outcomes), time.monotonic() - started_s)) + "\n"
+    for place in [f"{out}/{REPORT_NAME}", *([str(report)] if report is not None else [])]:
+        write_text(place, text)
+    return outcomes
+
+
+def selection_settings(start: str | None, end: str | None, topics: Sequence[str]) -> list[str]:
+    """The flags that select a part of a log, as overrides of the settings of `extract`."""
+    times = [f"extract.{name}={value}" for name, value in (("start", start), ("end", end)) if value is not None]
+    return times + ([f"extract.topics={json.dumps(list(topics))}"] if topics else [])
+
+
+def choose_engine(name: EngineName, num_tasks: int, num_workers: int | None) -> Engine:
+    """The engine, with as many workers as there are tasks, cores and room in memory for, unless `num_workers` says it.
+
+    Ray counts the cores of its cluster.
+    """
+    if num_workers is not None and num_workers < 0:
+        raise UsageError(f"--workers {num_workers}: must not be negative")
+    if name == "ray":
+        return partial(run_on_ray, num_workers=num_workers or None)
+    if num_workers is None:
+        num_workers = 0 if num_tasks == 1 else max(1, min(len(os.sched_getaffinity(0)), _free_bytes() // _WORKER_BYTES))
+    return partial(run_in_processes, num_workers=num_workers) if num_workers else run_in_sequence
+
+
+def _plan_line(tasks: Sequence[LogTask]) -> str:
+    """What is ahead. Whether it is really done is found out log by log, by what is in the files."""
+    size = tqdm.format_sizeof(sum(task.size_bytes for task in tasks), "B")
+    num_finished = sum(manifest_path(STAGES[-1], Path(task.directory)).is_file() for task in tasks)
+    return f"{len(tasks)} missions, {size}; {num_finished} were finished earlier, and are skipped where nothing has changed"
+
+
+def _renamed(tasks: Sequence[LogTask], out: str) -> Iterator[str]:
+    """A line for each log on disk that is new in `out`, where one of the same content was run, and is gone from its place."""
+    new = [t for t in tasks if len(t.parts) == 1 and not any(map(is_url, (*t.parts, out))) and not Path(t.directory).exists()]
+    gone = defaultdict[int, list[tuple[Catalogue, Path]]](list)
+    for path in sorted(Path(out).glob(f"*/{CATALOGUE_NAME}")) if new else ():
+        with contextlib.suppress(CadenceError):
+            found = read_catalogue(path.parent)
+            if found.path.parent.name != SOURCE_NAME and not found.path.exists():
+                gone[found.size_bytes].append((found, path.parent))
+    for task in [task for task in new if task.size_bytes in gone]:
+        digest = ""
+        with contextlib.suppress(CadenceError):  # a log that cannot be read says so itself, later
+            digest = hash_file(Path(task.parts[0]))
+        for found, directory in gone[task.size_bytes]:
+            if found.sha256 == digest:
+                yield f"{task.log}: is {found.path.name} renamed; it is run anew, as results bear its name; {directory} stays"
+
+
+class _Shown:
+    """A batch on stderr: one bar over the bytes of all logs, a line for each that is finished."""
+
+    def __init__(self, tasks: Sequence[LogTask], progress: Progress) -> None:
+        self._progress, self._num_tasks, self._num_finished = progress, len(tasks), 0
+        self._shares = {task.index: 0.0 for task in tasks}
+        self._bar = progress.bar(sum(task.size_bytes for task in tasks), "run", unit="B", scale=True)
+
+    def watch(self, task: LogTask, told: Told) -> None:
+        """A line of text, or how much of the task is done."""
+        if isinstance(told, str):
+            self._progress.note(told if self._num_tasks == 1 else f"{task.name}: {told}")
+        elif told > self._shares[task.index]:
+            self._bar.update((told - self._shares[task.index]) * task.size_bytes)
+            self._shares[task.index] = told
+
+    def finished(self, outcome: LogOutcome) -> None:
+        """The task is done with."""
+        self.watch(outcome.task, 1.0)
+        self._num_finished += 1
+        if outcome.trace:
+            self._progress.warn(outcome.trace)
+        counted = f"[{self._num_finished}/{self._num_tasks}]"
+        self._progress.note(f"{counted} {outcome.task.name}: {outcome.status} ({outcome.elapsed_s:.1f} s)")
+
+    def close(self) -> None:
+        """Take the bar away."""
+        self._bar.close()
+
+
+@contextlib.contextmanager
+def _interruptible() -> Iterator[None]:
+    """SIGTERM stops as Ctrl-C does: workers are stopped, what is half done is cleared away."""
+    if threading.current_thread() is not threading.main_thread():  # only there may handlers be set
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, _interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def _interrupt(number: int, frame: FrameType | None) -> None:
+    raise KeyboardInterrupt
+
+
+def _free_bytes() -> int:
+    """Memory that processes may still take; where the system does not tell, all there is."""
+    try:
+        line = next(line for line in _MEMINFO.read_text(encoding="utf-8").splitlines() if line.startswith("MemAvailable:"))
+    except (OSError, StopIteration):
+        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    return int(line.split()[1]) * 1024

@@ -1,0 +1,1 @@
+"""Episodes of recorded or simulated targets: what forecasts are trained on and scored against."""

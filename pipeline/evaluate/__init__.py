@@ -1,0 +1,1 @@
+"""Stage evaluate: hypotheses of missions against their truth, beside rivals."""

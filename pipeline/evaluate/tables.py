@@ -1,0 +1,324 @@
+"""Scored missions as tables: pooled rows with intervals, ratios between estimators, and their JSON, CSV and Markdown."""
+
+import csv
+import dataclasses
+import io
+import json
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from pipeline.evaluate.joint import JOINT_METRICS, JointCells, block_of, summarise_joint
+from pipeline.evaluate.scores import PARTS, Cells, ScoreRow, energy_ratio, groups_of, summarise
+
+OWN_NAME = "cadence"
+"""The estimator whose hypotheses a mission directory holds, in every table."""
+
+SCORES_VERSION = 1
+_MIN_LOGS = 6
+_PART_METRICS = {
+    "energy_score_m": "energy score m", "trajectory_energy_score_m": "trajectory energy m", "ade_m": "ADE m",
+    "min_ade_m": "minADE m", "mean_error_m": "error of mean m", "coverage_50": "in 50 %", "coverage_90": "in 90 %",
+    "spread_m": "spread m", "step_length_m": "step m", "true_step_length_m": "true step m", "collision_share": "collisions",
+}  # fmt: skip
+_JOINT_TITLES = {
+    "joint_energy_score_m": "joint energy m", "joint_min_ade_m": "joint minADE m", "gospa_m": "GOSPA m",
+    "localisation_error_m": "error of assigned m", "num_missed": "missed", "num_false": "false",
+}  # fmt: skip
+_WITH_INTERVAL = ("joint_energy_score_m", "joint_min_ade_m", "gospa_m")
+_SLICE_TITLES = {
+    ("between", "gap"): "Past, by length of the gap between the detections around it",
+    ("past", "nearest"): "Past, by time to the nearest detection",
+    ("past", "age"): "Past, by age of the last detection",
+    ("future", "horizon"): "Future, by horizon",
+    ("future", "age"): "Future, by age of the last detection",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class ScoredMission:
+    """Cells of the stored hypotheses and of every rival on the same windows.
+
+    cells         by estimator, OWN_NAME first; all in the same order
+    num_unscored  (window, agent) pairs with truth and detections but without hypotheses: these are spared
+    joint         by estimator, scores of all agents together; empty for one agent
+    is_matched    detections are of unknown origin: agents were matched to those of the truth
+    """
+
+    log_id: str
+    step_s: float
+    num_windows: int
+    agent_ids: tuple[str, ...]
+    num_hypotheses: int
+    max_truth_gap_s: float
+    num_unscored: int
+    cells: dict[str, Cells]
+    joint: dict[str, JointCells] = field(default_factory=dict)
+    gospa_cutoff_m: float | None = None
+    is_matched: bool = False
+
+
+@dataclass(frozen=True)
+class ScoredLog:
+    """What was scored of one log."""
+
+    log_id: str
+    step_s: float
+    num_windows: int
+    num_agents: int
+    num_hypotheses: int
+    max_truth_gap_s: float
+    num_unscored: int
+    gospa_cutoff_m: float | None = None
+    is_matched: bool = False
+
+
+@dataclass(frozen=True)
+class RatioRow:
+    """Energy score of an estimator over that of a rival on the same cells; below 1 it is ahead."""
+
+    estimator: str
+    rival: str
+    part: str
+    value: float
+    low: float
+    high: float
+    num_cells: int
+    num_groups: int
+
+
+@dataclass(frozen=True)
+class ScoreReport:
+    """Everything in scores.json. `grouped_by` says what was resampled: "log", "agent" or "block" of time."""
+
+    version: int
+    grouped_by: str
+    logs: tuple[ScoredLog, ...]
+    rows: tuple[ScoreRow, ...]
+    ratios: tuple[RatioRow, ...]
+
+
+def pool(missions: Sequence[ScoredMission], num_resamples: int, seed: int) -> ScoreReport:
+    """Rows and ratios over the cells of all missions; estimators that some mission lacks are left out."""
+    names = [name for name in missions[0].cells if all(name in mission.cells for mission in missions)]
+    cells = {name: Cells.concatenate([mission.cells[name] for mission in missions]) for name in names}
+    groups, grouped_by = _groups(missions)
+    own = cells[names[0]]
+    rows = [row for name in names for row in summarise(name, cells[name], groups, seed, num_resamples)]
+    rows += _joint_rows(missions, names, num_resamples, seed)
+    ratios = []
+    for rival in names[1:]:
+        for part in PARTS:
+            found = energy_ratio(own, cells[rival], part, groups, seed, num_resamples)
+            if found.num_values:
+                ratios.append(RatioRow(names[0], rival, part, *dataclasses.astuple(found)))
+    logs = tuple(
+        ScoredLog(
+            mission.log_id, mission.step_s, mission.num_windows, len(mission.agent_ids), mission.num_hypotheses,
+            mission.max_truth_gap_s, mission.num_unscored, mission.gospa_cutoff_m, mission.is_matched,
+        )
+        for mission in missions
+    )  # fmt: skip
+    return ScoreReport(SCORES_VERSION, grouped_by, logs, tuple(rows), tuple(ratios))
+
+
+def _joint_rows(missions: Sequence[ScoredMission], names: Sequence[str], num_resamples: int, seed: int) -> list[ScoreRow]:
+    """Rows on all agents together, over the missions of several agents; resampled are these, or blocks of time in them."""
+    several = [mission for mission in missions if mission.joint]
+    rows: list[ScoreRow] = []
+    for name in names:
+        cells = [mission.joint[name] for mission in several]
+        if len(missions) >= _MIN_LOGS:
+            groups = [np.full(len(part), index) for index, part in enumerate(cells)]
+        else:
+            groups = [
+                block_of(part, mission.num_windows) + 1000 * index
+                for index, (part, mission) in enumerate(zip(cells, several, strict=True))
+            ]
+        if several:
+            rows += summarise_joint(name, JointCells.concatenate(cells), np.concatenate(groups), seed, num_resamples)
+    return rows
+
+
+def as_json(report: ScoreReport) -> str:
+    """scores.json; NaN becomes null."""
+    return json.dumps(without_nan(dataclasses.asdict(report)), indent=1) + "\n"
+
+
+def as_csv(report: ScoreReport) -> str:
+    """scores.csv: a line per row."""
+    return rows_as_csv(ScoreRow, report.rows)
+
+
+def rows_as_csv(kind: type[Any], rows: Iterable[Any]) -> str:
+    """Instances of the dataclass `kind`, a line each under the names of its fields; None is an empty cell."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow([field.name for field in dataclasses.fields(kind)])
+    for row in rows:
+        writer.writerow(["" if value is None else value for value in dataclasses.astuple(row)])
+    return text.getvalue()
+
+
+def as_markdown(report: ScoreReport) -> str:
+    """scores.md: what a person reads first."""
+    lines = ["# Scores", "", *_preface(report)]
+    for part in PARTS:
+        lines += _part_table(report, part)
+    lines += _ratio_table(report)
+    lines += _joint_tables(report)
+    for (part, by), title in _SLICE_TITLES.items():
+        lines += _slice_table(report, part, by, title)
+    return "\n".join(lines).rstrip() + "\n"
+
+
+def headline(report: ScoreReport) -> list[dict[str, Any]]:
+    """The few numbers that a stage summary shows."""
+    metrics = ("energy_score_m", "ade_m", "coverage_90")
+    return [
+        {"estimator": row.estimator, "part": row.part, "metric": row.metric, "value": without_nan(row.value)}
+        for row in report.rows
+        if row.by == "part" and row.part in ("past", "future") and row.metric in metrics
+    ]
+
+
+def without_nan(value: Any) -> Any:
+    """The same JSON-able value with null for what is not a finite number."""
+    if isinstance(value, dict):
+        return {key: without_nan(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [without_nan(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _groups(missions: Sequence[ScoredMission]) -> tuple[npt.NDArray[np.int64], str]:
+    """Bootstrap group of every pooled cell: its log where there are enough logs, else its agent (and block of time)."""
+    own = [next(iter(mission.cells.values())) for mission in missions]
+    if len(missions) >= _MIN_LOGS:
+        return np.repeat(np.arange(len(own)), [len(cells) for cells in own]), "log"
+    parts, offset, is_by_agent = [], 0, True
+    for mission, cells in zip(missions, own, strict=True):
+        group = groups_of(cells, mission.num_windows)
+        is_by_agent &= np.array_equal(group, cells.agent)
+        parts.append(group + offset)
+        offset += int(group.max(initial=0)) + 1
+    return np.concatenate(parts), "agent" if is_by_agent else "block"
+
+
+def _preface(report: ScoreReport) -> list[str]:
+    whole = {"log": "logs", "agent": "agents", "block": "agents × ten blocks of time"}[report.grouped_by]
+    lines = [
+        f"Intervals: 95 %, bootstrap over {whole}. Energy scores in the plain form. Coverage is right at 50 and 90 %.",
+        "Means are over cells: one window, agent and step with known truth each.",
+        "",
+    ]
+    for log in report.logs[:20]:
+        spared = f"; {log.num_unscored} window-agent pairs had no hypotheses and are spared" if log.num_unscored else ""
+        lines.append(
+            f"* {log.log_id}: {log.num_windows} windows, {log.num_agents} agents, {log.num_hypotheses} hypotheses, "
+            f"step {log.step_s:g} s, truth interpolated over at most {log.max_truth_gap_s:g} s{spared}"
+        )
+    if len(report.logs) > 20:
+        lines.append(f"* and {len(report.logs) - 20} more logs")
+    return [*lines, ""]
+
+
+def _part_table(report: ScoreReport, part: str) -> list[str]:
+    found = {(row.estimator, row.metric): row for row in report.rows if row.by == "part" and row.part == part}
+    if not found:
+        return []
+    shown = [name for name in _PART_METRICS if any(metric == name for _, metric in found)]
+    lines = [f"## {part.capitalize()}", "", _line(["estimator", *(_PART_METRICS[name] for name in shown), "cells"])]
+    lines.append(_line(["---"] * (len(shown) + 2)))
+    for estimator in _ordered(row.estimator for row in found.values()):
+        rows = [found.get((estimator, name)) for name in shown]
+        cells = [(_with_interval if name == "energy_score_m" else _value)(row) for name, row in zip(shown, rows, strict=True)]
+        lines.append(_line([estimator, *cells, str(next((row.num_cells for row in rows if row), 0))]))
+    return [*lines, ""]
+
+
+def _ratio_table(report: ScoreReport) -> list[str]:
+    if not report.ratios:
+        return []
+    lines = [f"## Energy score of {report.ratios[0].estimator} over that of", ""]
+    lines += [_line(["rival", *PARTS]), _line(["---"] * (len(PARTS) + 1))]
+    for rival in _ordered(row.rival for row in report.ratios):
+        by_part = {row.part: row for row in report.ratios if row.rival == rival}
+        lines.append(_line([rival, *(_with_interval(by_part.get(part)) for part in PARTS)]))
+    return [*lines, ""]
+
+
+def _joint_tables(report: ScoreReport) -> list[str]:
+    """A table a part: all agents of a window as one vector, and as a set."""
+    rows = [row for row in report.rows if row.by == "joint"]
+    if not rows:
+        return []
+    lines = ["## All agents together", "", *_joint_preface(report)]
+    for part in PARTS:
+        found = {(row.estimator, row.metric): row for row in rows if row.part == part}
+        shown = [name for name in JOINT_METRICS if any(metric == name for _, metric in found)]
+        if shown:
+            lines += [f"### {part.capitalize()}", "", _line(["estimator", *(_JOINT_TITLES[name] for name in shown), "windows"])]
+            lines.append(_line(["---"] * (len(shown) + 2)))
+        for estimator in _ordered(name for name, _ in found):
+            cells = [found.get((estimator, name)) for name in shown]
+            texts = [
+                (_with_interval if name in _WITH_INTERVAL else _value)(row) for name, row in zip(shown, cells, strict=True)
+            ]
+            lines.append(_line([estimator, *texts, str(max(row.num_cells for row in cells if row))]))
+        lines += [""] if shown else []
+    return lines
+
+
+def _joint_preface(report: ScoreReport) -> list[str]:
+    whole = "logs" if report.grouped_by == "log" else "ten blocks of time"
+    lines = [
+        f"Intervals: bootstrap over {whole}. Joint scores take all agents of a window as one vector. GOSPA (order 2) compares",
+        "the weighted mean positions with the truth as sets; missed and false are agents a step.",
+    ]
+    cutoffs = sorted({f"{log.gospa_cutoff_m:.3g} m" for log in report.logs if log.gospa_cutoff_m is not None})
+    lines[-1] += f" Cut-off: {', '.join(cutoffs[:5])}."
+    if any(log.is_matched for log in report.logs):
+        lines.append(
+            "Where detections are of unknown origin, agents are matched to those of the truth, window by window, by the "
+            "detections that they were given; rivals see the detections under the likeliest way to tell them apart."
+        )
+    return [*lines, ""]
+
+
+def _slice_table(report: ScoreReport, part: str, by: str, title: str) -> list[str]:
+    rows = [row for row in report.rows if row.part == part and row.by == by]
+    if not rows:
+        return []
+    names = _ordered(row.estimator for row in rows)
+    lines = [f"## {title}", "", _line(["steps", *(f"{name} energy m" for name in names), f"{names[0]} in 90 %", "cells"])]
+    lines.append(_line(["---"] * (len(names) + 3)))
+    for bounds in _ordered((row.above_steps, row.up_to_steps) for row in rows):
+        found = {(row.estimator, row.metric): row for row in rows if (row.above_steps, row.up_to_steps) == bounds}
+        energies = [found.get((name, "energy_score_m")) for name in names]
+        label = f"{max(bounds[0] or 0.0, 0.0):g}–{bounds[1]:g}"
+        count = next((row.num_cells for row in energies if row), 0)
+        lines.append(_line([label, *map(_value, energies), _value(found.get((names[0], "coverage_90"))), str(count)]))
+    return [*lines, ""]
+
+
+def _ordered(values: Any) -> list[Any]:
+    return list(dict.fromkeys(values))
+
+
+def _line(cells: Sequence[str]) -> str:
+    return "| " + " | ".join(cells) + " |"
+
+
+def _value(row: ScoreRow | RatioRow | None) -> str:
+    return "–" if row is None or math.isnan(row.value) else f"{row.value:.3g}"
+
+
+def _with_interval(row: ScoreRow | RatioRow | None) -> str:
+    if row is None or math.isnan(row.low):
+        return _value(row)
+    return f"{row.value:.3g} [{row.low:.3g}, {row.high:.3g}]"

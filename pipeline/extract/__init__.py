@@ -1,0 +1,1 @@
+"""Stage extract: log and catalogue to tables of detections, truth, poses and obstacles."""

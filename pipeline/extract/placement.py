@@ -1,0 +1,167 @@
+"""Positions as read (metres in some frame, or degrees) → metres in one mission frame, east and north."""
+
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from cadence.errors import ConfigError, InputError
+from pipeline.extract.covariances import rotated
+from pipeline.extract.positions import Positions
+from pipeline.extract.transforms import Limits, TransformTree
+from pipeline.frames import DEFAULT_FRAME_ID, georeferenced_frame, to_local
+from pipeline.tables import Frame
+
+FIXED_FRAMES = {"map", "odom", "world", "mission", "enu", "local", "local_origin", "fixed"}
+"""Names of frames that are fixed by convention: what lies in one alone is never moved by transforms."""
+
+_NED_TO_ENU = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+
+
+@dataclass(frozen=True)
+class Placing:
+    """How positions come into the mission frame.
+
+    frame    name of the fixed frame that is wanted; None: chosen by `target_frame`
+    limits   how far from their samples transforms are believed
+    """
+
+    frame: str | None
+    limits: Limits
+
+
+def bring_together(
+    rows: Mapping[str, Positions], primary: str, placing: Placing, read_tree: Callable[[], TransformTree], counts: Counter[str]
+) -> dict[str, Positions]:
+    """The rows of every role, those in other frames moved by transforms into the one of the role `primary`, at their stamps.
+
+    The transforms are read only where they are needed. Rows whose frame no transform joins to that one stay as they are; those
+    at moments without a transform are left out and counted.
+    """
+    named = {name for positions in rows.values() for name, is_geodetic in _frames(positions) if name and not is_geodetic}
+    is_metric = placing.frame is not None or any(name and not is_geodetic for name, is_geodetic in _frames(rows[primary]))
+    if not named or not is_metric or (placing.frame is None and len(named) == 1 and named <= FIXED_FRAMES):
+        return dict(rows)
+    tree = read_tree()
+    target = target_frame(rows[primary], tree, placing.frame)
+    if target is None:
+        return dict(rows)
+    return {role: _moved(positions, target, tree, placing.limits, counts) for role, positions in rows.items()}
+
+
+def target_frame(primary: Positions, tree: TransformTree, wanted: str | None) -> str | None:
+    """The fixed frame for detections: their own one where it does not move, else the one in which all of theirs move.
+
+    None where they are not in metres or have none in common. Raises `ConfigError` where the wanted frame is in no transform.
+    """
+    names = sorted({name for name, is_geodetic in _frames(primary) if name and not is_geodetic})
+    if wanted is not None:
+        known = {*names, *tree.links, *(link.parent for link in tree.links.values())}
+        if wanted not in known:
+            listed = ", ".join(sorted(known)[:12]) or "none"
+            raise ConfigError(f"extract.frame: no position and no transform of the log is in {wanted!r}; known: {listed}")
+        return wanted
+    if len(names) == 1 and (names[0] in FIXED_FRAMES or tree.is_fixed(names[0])):
+        return names[0]
+    worlds = {tree.world(name) for name in names}
+    return worlds.pop() if len(worlds) == 1 else None
+
+
+def mission_frame(primary: Positions, others: Sequence[Positions], datum: tuple[float, float] | None) -> Frame:
+    """The frame that `primary` (what becomes detections) is in: its own for metres, about a datum for degrees.
+
+    Degrees and metres come together only where the datum of the metres is stated. Raises `InputError` where it comes in
+    several frames.
+    """
+    kinds = {("", True) if is_geodetic else (name, False) for name, is_geodetic in _frames(primary)}
+    if datum is not None and len(kinds) > 1:
+        kinds.discard(("", True))
+    if len(kinds) > 1:
+        parts = ", ".join(f"{topic} ({frame})" for topic, frame in sorted(_topics_with_frames(primary))[:6])
+        raise InputError(
+            f"detections come in different frames: {parts}; no transform of the log joins them: keep the topics of one frame "
+            "under [[extract.detections]], or state extract.datum where one of them is in latitude and longitude"
+        )
+    frame_id, is_geodetic = kinds.pop()
+    if not frame_id:  # nameless metres are taken to be in the one frame that the rest of the log names
+        names = {name for positions in others for name, geodetic in _frames(positions) if name and not geodetic}
+        frame_id = names.pop() if len(names) == 1 else DEFAULT_FRAME_ID
+    if is_geodetic:
+        rows = [positions[positions.is_geodetic] for positions in (primary, *others)]
+        latitude, longitude = np.concatenate([r.first for r in rows]), np.concatenate([r.second for r in rows])
+        return georeferenced_frame(latitude, longitude, datum)
+    return Frame(frame_id, *(datum or (None, None)))
+
+
+def place(positions: Positions, frame: Frame) -> tuple[Positions, int]:
+    """The rows that can be given in `frame`, with first and second its x_m and y_m; and how many cannot."""
+    if len(positions) == 0:
+        return positions, 0
+    is_same = np.isin(positions.frame_id.astype(np.str_), (frame.frame_id, ""))
+    is_placed = np.where(positions.is_geodetic, frame.is_georeferenced, is_same)
+    placed = positions[is_placed]
+    first, second = placed.first.copy(), placed.second.copy()
+    rows = placed.is_geodetic
+    if rows.any():
+        first[rows], second[rows] = to_local(frame, placed.first[rows], placed.second[rows])
+    return replace(placed, first=first, second=second, is_geodetic=np.zeros_like(rows)), int((~is_placed).sum())
+
+
+def in_enu(positions: Positions) -> Positions:
+    """The rows with x east, y north and z up; their frame, if it has a name, gets another one."""
+    rows = positions.is_ned & ~positions.is_geodetic
+    if not rows.any():
+        return positions
+    turned = _turned(positions, rows, np.broadcast_to(_NED_TO_ENU, (int(rows.sum()), 3, 3)), np.zeros(3))
+    frame_id = positions.frame_id.copy()
+    frame_id[rows] = [f"{name}_enu" if name else "" for name in frame_id[rows]]
+    return replace(turned, frame_id=frame_id)
+
+
+def _moved(positions: Positions, target: str, tree: TransformTree, limits: Limits, counts: Counter[str]) -> Positions:
+    frame_id = positions.frame_id.copy()
+    is_kept = np.ones(len(positions), dtype=np.bool_)
+    for name in sorted({name for name, is_geodetic in _frames(positions) if name and not is_geodetic and name != target}):
+        rows = np.flatnonzero((positions.frame_id == name) & ~positions.is_geodetic)
+        motion = tree.motion(name, target, positions.time_ns[rows], limits)
+        if motion is None:
+            continue
+        positions = _turned(positions, rows, motion.rotation, motion.translation_m)
+        frame_id[rows] = target
+        is_kept[rows] = motion.is_known
+        counts["transformed"] += int(motion.is_known.sum())
+        counts["no_transform"] += int((~motion.is_known).sum())
+    return replace(positions, frame_id=frame_id)[is_kept]
+
+
+def _turned(positions: Positions, rows: np.ndarray, rotation: np.ndarray, translation_m: np.ndarray) -> Positions:
+    """The positions with those of `rows` (a mask or numbers) turned and moved, and their covariances turned."""
+    columns = {
+        name: getattr(positions, name).copy() for name in ("first", "second", "z_m", "covariance_m2", "height_covariance_m2")
+    }
+    heights = columns["z_m"][rows]
+    points = np.column_stack([columns["first"][rows], columns["second"][rows], np.nan_to_num(heights)])
+    moved = np.einsum("nij,nj->ni", rotation, points) + translation_m
+    columns["first"][rows], columns["second"][rows] = moved[:, 0], moved[:, 1]
+    columns["z_m"][rows] = np.where(np.isnan(heights), np.nan, moved[:, 2])
+    full = np.concatenate([columns["covariance_m2"][rows], columns["height_covariance_m2"][rows]], axis=1)
+    full = rotated(full, rotation)
+    columns["covariance_m2"][rows], columns["height_covariance_m2"][rows] = full[:, :3], full[:, 3:]
+    return replace(positions, **columns)
+
+
+def _frames(positions: Positions) -> set[tuple[str, bool]]:
+    """(frame id, is geodetic) of metric and geodetic rows; metric rows without a frame id are taken to be in the others'."""
+    found = {
+        (str(name), bool(is_geodetic)) for name, is_geodetic in zip(positions.frame_id, positions.is_geodetic, strict=True)
+    }
+    is_named = any(name and not is_geodetic for name, is_geodetic in found)
+    return {(name, is_geodetic) for name, is_geodetic in found if is_geodetic or name or not is_named}
+
+
+def _topics_with_frames(positions: Positions) -> set[tuple[str, str]]:
+    return {
+        (str(topic), "latitude and longitude" if is_geodetic else str(name) or "no frame id")
+        for topic, name, is_geodetic in zip(positions.topic, positions.frame_id, positions.is_geodetic, strict=True)
+    }

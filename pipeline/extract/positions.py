@@ -1,0 +1,332 @@
+"""Messages → columns of positions: which source reads which channel, and what each of its messages says.
+
+What cannot be used is counted, never passed on in silence.
+"""
+
+import math
+from array import array
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields
+from functools import partial
+from typing import Any, Self
+
+import numpy as np
+import numpy.typing as npt
+
+from cadence.errors import ConfigError
+from pipeline.extract.columns import FieldColumns, mapped
+from pipeline.extract.covariances import NONE_COVARIANCE, Covariance, isotropic, stated_covariance, stated_covariances
+from pipeline.extract.stamps import stamp_ns
+from pipeline.logs.channels import Batch
+from pipeline.logs.decode import UndecodableChannel
+from pipeline.logs.reader import Channel, RawMessage
+from pipeline.mapping.message_path import MissingFieldError, Place, at_place, parse_path
+from pipeline.mapping.sources import LOG_TIME, PATH_KEYS, PUBLISH_TIME, SourceConfig, resolve_paths
+
+Float64s = npt.NDArray[np.float64]
+Objects = npt.NDArray[np.object_]
+
+Point = tuple[Place, Any, Any, Any]
+"""Place in the message; x, y and z, or latitude, longitude and altitude, as the message has them."""
+
+
+@dataclass(frozen=True, eq=False)
+class Positions:
+    """Columns of N rows. NaN and None stand for what a message does not state.
+
+    first, second  x_m and y_m, or latitude_deg and longitude_deg where is_geodetic
+    covariance_m2  [N, 3] xx, xy, yy
+    height_covariance_m2  [N, 3] xz, yz, zz: what a tilted sensor frame turns into those
+    is_ned         whether x is north, y east and z down in the frame that the positions end in
+    is_stated      whether the user configured the source (else it was suggested)
+    """
+
+    time_ns: npt.NDArray[np.int64]
+    log_time_ns: npt.NDArray[np.int64]
+    sequence: npt.NDArray[np.int64]
+    first: Float64s
+    second: Float64s
+    z_m: Float64s
+    covariance_m2: Float64s
+    height_covariance_m2: Float64s
+    score: npt.NDArray[np.float32]
+    agent: Objects
+    sensor: Objects
+    topic: Objects
+    frame_id: Objects
+    is_geodetic: npt.NDArray[np.bool_]
+    is_ned: npt.NDArray[np.bool_]
+    is_stated: npt.NDArray[np.bool_]
+
+    def __len__(self) -> int:
+        return len(self.time_ns)
+
+    def __getitem__(self, rows: Any) -> Self:
+        """The rows of a mask, of indices or of a slice."""
+        return type(self)(*(getattr(self, item.name)[rows] for item in fields(self)))
+
+    @classmethod
+    def concatenate(cls, parts: Sequence["Positions"]) -> "Positions":
+        """All rows of `parts`, in order."""
+        return cls(*(np.concatenate([getattr(part, item.name) for part in parts]) for item in fields(cls)))
+
+
+class Rows:
+    """Growing columns of one reader (`Positions` once complete)."""
+
+    def __init__(self) -> None:
+        self.integers = array("q")  # time, log time, sequence
+        self.floats = array("d")  # first, second, z, score, covariance
+        self.agents: list[str | None] = []
+        self.sensors: list[str | None] = []
+        self.frame_ids: list[str] = []
+
+    def finish(self, topic: str = "", is_geodetic: bool = False, is_ned: bool = False, is_stated: bool = False) -> Positions:
+        """The columns as arrays."""
+        integers = np.array(self.integers, dtype=np.int64).reshape(-1, 3)
+        floats = np.array(self.floats, dtype=np.float64).reshape(-1, 10)
+        num_rows = len(integers)
+        return Positions(
+            integers[:, 0], integers[:, 1], integers[:, 2],
+            floats[:, 0], floats[:, 1], floats[:, 2], floats[:, 4:7], floats[:, 7:], floats[:, 3].astype(np.float32),
+            np.array(self.agents, dtype=object), np.array(self.sensors, dtype=object),
+            np.full(num_rows, topic, dtype=object), np.array(self.frame_ids, dtype=object),
+            np.full(num_rows, is_geodetic), np.full(num_rows, is_ned), np.full(num_rows, is_stated),
+        )  # fmt: skip
+
+
+class FieldReader:
+    """Alternative message paths of one field; tries first the one that served the last message.
+
+    `convert` turns a value into what is kept, None where it is not filled in; then the next alternative is tried.
+    """
+
+    def __init__(self, texts: Iterable[str], is_needed: bool = False, convert: Callable[[Any], Any] | None = None) -> None:
+        self.paths = [parse_path(text) for text in texts]
+        self.is_needed = is_needed
+        self.is_found = False
+        self._problem: tuple[str, MissingFieldError] | None = None
+        self._convert = convert
+        self._order = list(range(len(self.paths)))
+
+    @property
+    def problem(self) -> str:
+        """What the last path that led nowhere was lacking."""
+        return "path {!r}: {}".format(*self._problem) if self._problem is not None else "it"
+
+    def located(self, message: Any) -> Mapping[Place, Any] | None:
+        """The values by place; None where no alternative leads anywhere."""
+        unfilled: Mapping[Place, Any] | None = None
+        for rank, number in enumerate(self._order):
+            try:
+                values = self.paths[number].located(message)
+            except MissingFieldError as error:
+                self._problem = self.paths[number].text, error
+                continue
+            self.is_found = True
+            if self._convert is not None:
+                values = {place: self._convert(value) for place, value in values.items()}
+                if values and all(value is None for value in values.values()):
+                    unfilled = unfilled or values
+                    continue
+            if rank:
+                self._order.insert(0, self._order.pop(rank))
+            return values
+        return unfilled
+
+
+class ChannelReader:
+    """Reads one channel for one source. `named` holds what the topic says: agent, sensor."""
+
+    def __init__(self, channel: Channel, source: SourceConfig, role: str, is_stated: bool, named: Mapping[str, str]) -> None:
+        paths = resolve_paths(source, channel.schema_name)
+        self.channel, self.source, self.role, self.is_stated = channel, source, role, is_stated
+        self.is_geodetic = bool(paths.latitude)
+        self.names = {"agent": named.get("agent", source.agent), "sensor": named.get("sensor", source.sensor)}
+        names = _GEODETIC if self.is_geodetic else _METRIC
+        alternatives = [getattr(paths, name) for name in names]
+        self.alternatives = paths.alternatives
+        if self.alternatives == "first":
+            self.positions = [tuple(self._field(name, texts) for name, texts in zip(names, alternatives, strict=True))]
+        else:
+            self.positions = [
+                tuple(self._field(name, (text,)) for name, text in zip(names, texts, strict=True))
+                for texts in zip(*alternatives, strict=True)
+            ]
+        fields = {name: self._field(name, getattr(paths, name)) for name in _OTHERS}
+        self.fields = {name: reader for name, reader in fields.items() if reader.paths}
+        self.unknown = NONE_COVARIANCE if source.sigma_m is None else isotropic(source.sigma_m**2)
+        self.rows = Rows()
+        self.counts: Counter[str] = Counter()
+
+    def _field(self, name: str, paths: Sequence[str]) -> FieldReader:
+        """Fields that a constant replaces have no path; those that the user stated must be in some message."""
+        if self.names.get(name) is not None:
+            return FieldReader(())
+        if name == "time" and self.source.time in (LOG_TIME, PUBLISH_TIME):
+            return FieldReader(())
+        is_stated = getattr(self.source, PATH_KEYS.get(name, name), None) is not None
+        is_position = name in ("x", "y", "latitude", "longitude") and self.source.preset is not None and self.is_stated
+        return FieldReader(paths, bool(paths) and (is_stated or is_position), _CONVERSIONS.get(name))
+
+    def read(self, message: Any, raw: RawMessage) -> None:
+        """Append the positions of one decoded message, or count why there are none."""
+        self.counts["messages"] += 1
+        points = self._points(message)
+        if points is None:
+            self.counts["incomplete"] += 1
+            return
+        found = [(name, located) for name, reader in self.fields.items() if (located := reader.located(message))]
+        default_ns = raw.publish_time_ns if self.source.time == PUBLISH_TIME else raw.log_time_ns
+        for place, first, second, z in points:
+            values: dict[str, Any] = dict.fromkeys(_OTHERS)
+            for name, located in found:
+                values[name] = located[place] if place in located else at_place(located, place)
+            if self._has_no_fix(values):
+                self.counts["no_fix"] += 1
+                continue
+            covariance = self._covariance(values["covariance"], values["covariance_type"])
+            time_ns = default_ns if values["time"] is None else values["time"]
+            self.rows.integers.extend((time_ns, raw.log_time_ns, raw.sequence))
+            self.rows.floats.extend((_number(first), _number(second), _number(z), _number(values["score"]), *covariance))
+            self.rows.agents.append(self._identity("agent", values["agent"], place))
+            self.rows.sensors.append(self._identity("sensor", values["sensor"], place))
+            self.rows.frame_ids.append(values["frame_id"] or "")
+
+    def field_columns(self) -> FieldColumns:
+        """What reads the source's fields of many messages at once; `UndecodableChannel` where that cannot be done."""
+        if self.alternatives != "first":
+            raise UndecodableChannel(f"{self.channel.topic}: holds several positions a message")
+        readers = dict(zip(_COLUMNS, self.positions[0], strict=True)) | self.fields
+        columns = FieldColumns(self.channel, {name: reader.paths for name, reader in readers.items()})
+        if not {"first", "second"} | {name for name, reader in readers.items() if reader.is_needed} <= columns.names:
+            raise UndecodableChannel(f"{self.channel.topic}: lacks a field")
+        return columns
+
+    def read_columns(self, columns: Mapping[str, npt.NDArray[Any]], batch: Batch) -> None:
+        """Append what `field_columns` read of a batch: rows and counts are those of `read`, one message after the other."""
+        self.counts["messages"] += len(batch)
+        for name, reader in zip((*_COLUMNS, *self.fields), (*self.positions[0], *self.fields.values()), strict=True):
+            reader.is_found = reader.is_found or name in columns
+        has_fix = np.ones(len(batch), np.bool_)
+        if "status" in columns:
+            has_fix &= ~(columns["status"] < 0)
+        if "flags" in columns:
+            has_fix &= columns["flags"] % 2 != 0
+        num_rows = int(has_fix.sum())
+        self.counts["no_fix"] += len(batch) - num_rows
+        columns = {name: column[has_fix] for name, column in columns.items()}
+        log_time_ns, sequence = batch.log_time_ns[has_fix], batch.sequence[has_fix]
+        time_ns = batch.publish_time_ns[has_fix].astype(np.int64) if self.source.time == PUBLISH_TIME else log_time_ns
+        if "time" in columns:
+            time_ns = np.where(columns["time"] == 0, time_ns, columns["time"])
+        absent = np.full(num_rows, math.nan)
+        numbers = [columns.get(name, absent) for name in (*_COLUMNS, "score")]
+        self.rows.integers.frombytes(np.column_stack([time_ns, log_time_ns, sequence]).astype(np.int64).tobytes())
+        self.rows.floats.frombytes(np.column_stack([*numbers, self._covariances(columns, num_rows)]).tobytes())
+        for kind, names in (("agent", self.rows.agents), ("sensor", self.rows.sensors)):
+            stated = columns[kind].tolist() if kind in columns else [None] * num_rows
+            names += mapped(stated, partial(self._identity, kind, place=()))
+        frames = columns["frame_id"].tolist() if "frame_id" in columns else [""] * num_rows
+        self.rows.frame_ids += mapped(frames, lambda name: _frame_name(name) or "")
+
+    def check(self) -> None:
+        """`ConfigError` where something that the user stated was in no message."""
+        alternatives = [(reader,) for reader in self.fields.values()] + list(zip(*self.positions, strict=True))
+        for readers in alternatives:
+            if readers[0].is_needed and self.counts["messages"] and not any(reader.is_found for reader in readers):
+                where = f"extract.{self.role}, topic {self.channel.topic}"
+                raise ConfigError(f"{where}: no message has {readers[0].problem}; correct the [extract] entry")
+
+    def finish(self) -> Positions:
+        """All rows read."""
+        return self.rows.finish(self.channel.topic, self.is_geodetic, self.source.frame_convention == "ned", self.is_stated)
+
+    def _points(self, message: Any) -> list[Point] | None:
+        """All positions in a message; None where no path leads to any."""
+        found = [points for position in self.positions if (points := self._joined(position, message)) is not None]
+        if len(found) < 2:
+            return found[0] if found else None
+        if self.alternatives == "all":
+            return [point for points in found for point in points]
+        filled = {point[0]: point for points in reversed(found) for point in points if any(point[1:])}
+        return [filled.get(point[0], point) for point in found[0]]
+
+    def _joined(self, position: Sequence[FieldReader], message: Any) -> list[Point] | None:
+        """The items that have both of the first two coordinates; the others are counted."""
+        firsts, seconds = position[0].located(message), position[1].located(message)
+        if firsts is None or seconds is None:
+            return None
+        zs = position[2].located(message) or {}
+        points = [(place, first, seconds[place], at_place(zs, place)) for place, first in firsts.items() if place in seconds]
+        self.counts["incomplete"] += len(firsts.keys() | seconds.keys()) - len(points)
+        return points
+
+    def _has_no_fix(self, values: Mapping[str, Any]) -> bool:
+        status, flags = values["status"], values["flags"]
+        return (status is not None and _number(status) < 0) or (isinstance(flags, int) and flags % 2 == 0)
+
+    def _covariance(self, matrix: Any, kind: Any) -> Covariance:
+        """What is unknown takes the source's sigma_m; so does what is no covariance, which is counted."""
+        if matrix is None or kind == 0 or (isinstance(kind, str) and "UNKNOWN" in kind):
+            return self.unknown
+        try:
+            return stated_covariance(matrix) or self.unknown
+        except (LookupError, TypeError, ValueError, OverflowError):
+            self.counts["bad_covariance"] += 1
+            return self.unknown
+
+    def _covariances(self, columns: Mapping[str, npt.NDArray[Any]], num_rows: int) -> Float64s:
+        """`_covariance` [N, 6] of many messages at once."""
+        if "covariance" not in columns:
+            return np.tile(np.array(self.unknown), (num_rows, 1))
+        covariances, is_stated, is_bad = stated_covariances(columns["covariance"])
+        says_something = columns["covariance_type"] != 0 if "covariance_type" in columns else np.ones(num_rows, np.bool_)
+        self.counts["bad_covariance"] += int((is_bad & says_something).sum())
+        return np.where((is_stated & says_something)[:, None], covariances, np.array(self.unknown))
+
+    def _identity(self, kind: str, value: Any, place: Place) -> str | None:
+        """Constant, from a field, or None; truth and poses need a name, so theirs is at last the topic's (and the place)."""
+        constant = self.names[kind]
+        name = _name(value) if constant is None else constant
+        if name is not None or kind != {"truth": "agent", "poses": "sensor"}.get(self.role):
+            return name
+        topic = self.channel.topic.strip("/") or self.role
+        return "/".join([topic, *map(str, place)])
+
+
+def _frame_name(value: Any) -> str | None:
+    return value.lstrip("/") or None if isinstance(value, str) else None  # ROS 1 wrote /map
+
+
+_COLUMNS = ("first", "second", "z")
+_METRIC = ("x", "y", "z")
+_GEODETIC = ("latitude", "longitude", "altitude")
+_OTHERS = ("covariance", "covariance_type", "status", "flags", "time", "frame_id", "agent", "sensor", "score")
+_CONVERSIONS: Mapping[str, Callable[[Any], Any]] = {"time": stamp_ns, "frame_id": _frame_name}
+
+
+def _number(value: Any) -> float:
+    """A float; NaN for what is no number."""
+    if value is None:
+        return math.nan
+    try:
+        return float(value)
+    except (TypeError, ValueError, OverflowError):
+        return math.nan
+
+
+def _name(value: Any) -> str | None:
+    """An identity as text; None for none. UUIDs as bytes or numbers become hexadecimal."""
+    if value is None or value == "":
+        return None
+    if isinstance(value, str | int):
+        return str(value)
+    if isinstance(value, float) and value.is_integer():
+        return str(int(value))
+    inner = getattr(value, "uuid", value)
+    try:
+        return bytes(inner).hex()
+    except (TypeError, ValueError):
+        return str(inner)

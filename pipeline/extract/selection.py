@@ -1,0 +1,127 @@
+"""Which sources serve which role for one log: what the user states, and what the channels suggest for the rest."""
+
+import fnmatch
+from collections.abc import Mapping, Sequence
+
+from cadence.errors import ConfigError, InputError, NothingDetectedError
+from pipeline.extract.positions import ChannelReader
+from pipeline.extract.thinning import ThinningConfig
+from pipeline.logs.reader import Channel
+from pipeline.mapping.guess import SuggestedMapping, dense_sources, describe_channels, suggest_mapping
+from pipeline.mapping.presets import preset_for
+from pipeline.mapping.sources import SourceConfig
+
+ROLES = ("detections", "truth", "poses")
+_OTHER_ROLES = ("truth", "poses", "tf", "obstacles")
+"""Of channels that are known not to hold detections; many recorders write a channel only with its first message."""
+
+
+Sources = Mapping[str, tuple[SourceConfig, ...]]
+"""Sources by role: "detections", "truth", "poses"."""
+
+
+def selected_channels(channels: Sequence[Channel], patterns: Sequence[str]) -> tuple[Channel, ...]:
+    """The channels whose topic fits one of `patterns` (`*` stands for any characters); all of them without patterns.
+
+    Raises `ConfigError` where a pattern fits none.
+    """
+    for pattern in patterns:
+        if not any(fnmatch.fnmatchcase(channel.topic, pattern) for channel in channels):
+            raise ConfigError(f"extract.topics: no topic of the log fits {pattern!r}; topics: {describe_channels(channels)}")
+    return tuple(c for c in channels if not patterns or any(fnmatch.fnmatchcase(c.topic, pattern) for pattern in patterns))
+
+
+def select_readers(
+    stated: Sources, suggest: bool, thinning: ThinningConfig, channels: Sequence[Channel]
+) -> tuple[ChannelReader, ...]:
+    """A reader for every channel of every role; with `suggest`, the names of topics fill the roles that the user left empty.
+
+    Raises `ConfigError` where a stated topic is not in the log or its schema needs paths, `InputError` where nothing can
+    serve as detections, `NothingDetectedError` where the channels tell that nothing was detected; all name the channels and
+    what to write.
+    """
+    suggested = suggest_mapping(channels)
+    taken = _topics([source for sources in stated.values() for source in sources], channels)
+    chosen = {role: stated[role] for role in ROLES}
+    for role in ROLES:
+        if suggest and not stated[role]:
+            chosen[role] = _untaken(getattr(suggested, role), channels, taken)
+    if thinning.enabled and thinning.thin_from == "truth":
+        if not chosen["truth"]:
+            # The only dense channel may have been stated as a pose: that is what pasting the suggested lines gives.
+            chosen["truth"] = _dense(suggested, channels, _topics(stated["detections"], channels), bool(chosen["detections"]))
+            chosen["poses"] = _untaken(chosen["poses"], channels, _topics(chosen["truth"], channels))
+        chosen["detections"] = ()
+    elif not chosen["detections"]:
+        is_known = all(suggested.roles.get(channel.topic) in _OTHER_ROLES for channel in channels)
+        failure = NothingDetectedError if is_known or _are_silent(suggested, channels) else InputError
+        raise failure(_no_detections(suggested, channels))
+    readers = []
+    for role in ROLES:
+        for source in chosen[role]:
+            readers += _readers(role, source, bool(stated[role]), channels)
+    return tuple(readers)
+
+
+def _topics(sources: Sequence[SourceConfig], channels: Sequence[Channel]) -> set[str]:
+    return {channel.topic for channel in channels if any(source.match(channel.topic) is not None for source in sources)}
+
+
+def _untaken(sources: tuple[SourceConfig, ...], channels: Sequence[Channel], taken: set[str]) -> tuple[SourceConfig, ...]:
+    """The sources none of whose topics is `taken`."""
+    return tuple(source for source in sources if not taken & _topics([source], channels))
+
+
+def _dense(
+    suggested: SuggestedMapping, channels: Sequence[Channel], taken: set[str], has_detections: bool
+) -> tuple[SourceConfig, ...]:
+    """The only position channel (or the channels of one pattern): what is thinned where no truth is named."""
+    dense = _untaken(dense_sources(channels, suggested), channels, taken)
+    if has_detections:
+        raise InputError(
+            "thinning: the log has detections but no truth to thin; name a dense channel under [[extract.truth]], or thin the "
+            'detections with extract.thinning.thin_from = "detections"'
+        )
+    if len(dense) != 1:
+        found = "several dense position channels" if dense else "no position channel that could be thinned"
+        topics = ", ".join(source.topic for source in dense) or describe_channels(channels)
+        raise InputError(f'thinning: {found}: {topics}; name one: [[extract.truth]] topic = "/..." (see cadence info)')
+    return dense
+
+
+def _readers(role: str, source: SourceConfig, is_stated: bool, channels: Sequence[Channel]) -> list[ChannelReader]:
+    named = [(channel, found) for channel in channels if (found := source.match(channel.topic)) is not None]
+    if not named:
+        raise ConfigError(
+            f"extract.{role}: no topic of the log is {source.topic!r}; topics: {describe_channels(channels)}; correct the entry"
+        )
+    return [ChannelReader(channel, source, role, is_stated, found) for channel, found in named]
+
+
+def _named(suggested: SuggestedMapping, channels: Sequence[Channel]) -> list[Channel]:
+    """The channels whose names tell of detections."""
+    return [channel for channel in channels if suggested.roles.get(channel.topic) == "detections"]
+
+
+def _are_silent(suggested: SuggestedMapping, channels: Sequence[Channel]) -> bool:
+    """Whether there are channels of detections, all of a known type, on which nothing was recorded."""
+    named = _named(suggested, channels)
+    return bool(named) and all(preset_for(channel.schema_name) is not None for channel in named)
+
+
+def _no_detections(suggested: SuggestedMapping, channels: Sequence[Channel]) -> str:
+    """One line: what is there, and the lines that would make detections of it."""
+    named = _named(suggested, channels)
+    unread = sorted({channel.topic for channel in named if preset_for(channel.schema_name) is None})
+    if _are_silent(suggested, channels):
+        return f"no message was recorded on {describe_channels(named)}; name other topics under [[extract.detections]]"
+    if unread:
+        paths = 'add [[extract.detections]] with topic, x = "path", y = "path" (or latitude, longitude)'
+        return f"no preset knows the schema of {', '.join(unread)}; {paths}; cadence info LOG prints the lines"
+    dense = [source.topic for source in (*suggested.truth, *dense_sources(channels, suggested))]
+    if not dense:
+        advice = 'add [[extract.detections]] with topic = "/...", x = "path", y = "path" (or latitude, longitude)'
+    else:
+        entry = f'add [[extract.detections]] with topic = "{dense[0]}"'
+        advice = f"{entry}, or make sparse detections of a dense channel with --set extract.thinning.enabled=true"
+    return f"nothing looks like detections among {describe_channels(channels)}; {advice}; cadence info LOG prints the lines"

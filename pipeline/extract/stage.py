@@ -1,0 +1,355 @@
+"""Extract: catalogue and log → detections.parquet, truth.parquet, poses.parquet, obstacles.json.
+
+Decoded messages become rows in the mission frame, sorted by time; whatever is left out is counted in the summary.
+"""
+
+import contextlib
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+
+from cadence.errors import ConfigError, InputError, NothingDetectedError
+from pipeline.extract.collapse import Collapsed, collapse
+from pipeline.extract.obstacle_sources import OBSTACLES_NAME, ObstacleSources, collect_obstacles, write_obstacles
+from pipeline.extract.placement import Placing, bring_together, in_enu, mission_frame, place
+from pipeline.extract.positions import ChannelReader, Positions, Rows
+from pipeline.extract.reading import read_positions
+from pipeline.extract.selection import ROLES, select_readers, selected_channels
+from pipeline.extract.spikes import is_spike
+from pipeline.extract.stamps import moment_ns
+from pipeline.extract.thinning import ThinningConfig, is_seen, noise
+from pipeline.extract.transform_messages import LogTransforms
+from pipeline.extract.transforms import Limits
+from pipeline.ingest.stage import CATALOGUE_NAME, open_catalogued_log, read_catalogue
+from pipeline.logs.reader import MissionLog
+from pipeline.manifest import StageResult, run_stage
+from pipeline.mapping.sources import SourceConfig
+from pipeline.progress import Progress
+from pipeline.tables import Frame, write_table
+from schemas.tables import DETECTIONS, POSES, TRUTH
+
+_STAMPS_APART_S = 3600.0
+
+
+@dataclass(frozen=True)
+class ExtractConfig:
+    """What to take from a log.
+
+    detections, truth, poses   the sources of each role
+    suggest          fill roles that are left empty by what the names of topics suggest
+    thinning         make sparse detections out of a dense channel
+    simultaneity_s   detections of one agent within this time are collapsed into one
+    topics           patterns ("/radar/*"); take positions only from topics that fit one of them; empty: from all
+    start, end       use only messages logged in this part: seconds after the log's first message, or a moment (ISO 8601)
+    frame            name of the fixed frame to bring detections into, by the log's transforms; by default their own where it
+                     does not move, else the one that it moves in
+    max_extrapolation_s   how long before its first and after its last sample a transform holds; later positions are refused
+    max_transform_gap_s   longest time between two samples over which a transform is interpolated
+    default_sigma_m  standard deviation of detections that state none; without it they count as exact
+    max_speed_mps    single positions that could only be reached and left again faster are recorder faults (see `spikes`)
+    datum            [latitude, longitude] in degrees of x = y = 0; by default the median of all positions, and unknown for
+                     logs in metres
+    obstacles        where obstacles come from; by default what the log says
+    """
+
+    detections: tuple[SourceConfig, ...] = ()
+    truth: tuple[SourceConfig, ...] = ()
+    poses: tuple[SourceConfig, ...] = ()
+    suggest: bool = True
+    thinning: ThinningConfig = field(default_factory=ThinningConfig)
+    simultaneity_s: float = 0.001
+    topics: tuple[str, ...] = ()
+    start: float | str | None = None
+    end: float | str | None = None
+    frame: str | None = None
+    max_extrapolation_s: float = 0.5
+    max_transform_gap_s: float = 10.0
+    default_sigma_m: float | None = None
+    max_speed_mps: float | None = 1000.0
+    datum: tuple[float, float] | None = None
+    obstacles: ObstacleSources = field(default_factory=ObstacleSources)
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.simultaneity_s < np.inf:
+            raise ValueError("simultaneity_s must not be negative")
+        if self.default_sigma_m is not None and not 0 < self.default_sigma_m < np.inf:
+            raise ValueError("default_sigma_m must be positive")
+        if self.max_speed_mps is not None and not self.max_speed_mps > 0:
+            raise ValueError("max_speed_mps must be positive")
+        if not (0 <= self.max_extrapolation_s < np.inf and 0 < self.max_transform_gap_s < np.inf):
+            raise ValueError("max_extrapolation_s must not be negative, and max_transform_gap_s must be positive")
+        for name in ("start", "end"):
+            value = getattr(self, name)
+            if value is not None and moment_ns(value, 0) is None:
+                raise ValueError(f'{name} = {value!r}: expected seconds after the start of the log, or "2024-05-01T12:30:00Z"')
+        if self.datum is not None and not (abs(self.datum[0]) <= 90 and abs(self.datum[1]) <= 180):
+            raise ValueError(f"datum {list(self.datum)}: expected [latitude, longitude] in degrees")
+
+
+def extract(directory: Path, config: ExtractConfig, progress: Progress, force: bool = False) -> StageResult:
+    """Write the tables of the log that `directory` was ingested from.
+
+    Raises `InputError` where no detection is left, of which `NothingDetectedError` where none was recorded.
+    """
+    catalogue = read_catalogue(directory)
+
+    def body(work: Path) -> dict[str, Any]:
+        return write_tables(open_catalogued_log(catalogue), work, config, progress)
+
+    for path in config.obstacles.files:
+        if not path.is_file():
+            raise ConfigError(f"{path}: not a file; correct extract.obstacles.files")
+    inputs = [directory / CATALOGUE_NAME, *config.obstacles.files]
+    return run_stage("extract", directory, config=config, inputs=inputs, body=body, force=force)
+
+
+def write_tables(log: MissionLog, folder: Path, config: ExtractConfig, progress: Progress) -> dict[str, Any]:
+    """Write the files of the stage for `log` into `folder`; the summary."""
+    stated = {"detections": config.detections, "truth": config.truth, "poses": config.poses}
+    transforms = LogTransforms(log, progress)
+    with _about(log):
+        channels = selected_channels(log.channels, config.topics)
+        readers = select_readers(stated, config.suggest, config.thinning, channels)
+        counts = read_positions(log, readers, progress, *_cut_ns(log, config))
+        rows, frame = _rows_in_frame(readers, config, counts, transforms)
+    counts["unselected_topics"] = len({c.topic for c in log.channels} - {c.topic for c in channels})
+    detections = collapse(_with_default_sigma(rows["detections"], config.default_sigma_m), config.simultaneity_s)
+    counts["collapsed"] = len(rows["detections"]) - len(detections.positions)
+    truth, counts["duplicate_truth"] = _without_repeats(rows["truth"])
+    log_id = log.name
+    write_table(_detection_table(log_id, detections), folder / "detections.parquet", "detections", frame)
+    if len(truth):
+        write_table(_track_table(log_id, truth, "agent_id", truth.agent, TRUTH), folder / "truth.parquet", "truth", frame)
+    poses = rows["poses"]
+    if len(poses):
+        write_table(_track_table(log_id, poses, "sensor_id", poses.sensor, POSES), folder / "poses.parquet", "poses", frame)
+    obstacles = collect_obstacles(log, config.obstacles, frame, progress.note)
+    write_obstacles(folder / OBSTACLES_NAME, obstacles)
+    _tell(counts, detections.positions, log, progress)
+    transforms.tell()
+    if frame.frame_id.lower().endswith("ned"):
+        progress.note(
+            f'extract: frame {frame.frame_id} may be north-east-down; if so give its sources frame_convention = "ned"'
+        )
+    summary = _summary(log, readers, detections.positions, truth, poses, frame, counts, len(obstacles))
+    return summary | {"transforms": transforms.summary(counts)}
+
+
+@contextlib.contextmanager
+def _about(log: MissionLog) -> Iterator[None]:
+    """Put the log's path before what is wrong with its content."""
+    try:
+        yield
+    except InputError as error:
+        raise type(error)(f"{log.path}: {error}") from error
+
+
+def _cut_ns(log: MissionLog, config: ExtractConfig) -> tuple[int | None, int | None]:
+    """First log time that is used, and the first after it that is not."""
+    start = None if config.start is None else moment_ns(config.start, log.start_ns)
+    end = None if config.end is None else moment_ns(config.end, log.start_ns)
+    if start is not None and end is not None and end < start:
+        raise ConfigError(f"extract.start {config.start!r} lies after extract.end {config.end!r}; correct them")
+    return start, None if end is None else end + 1
+
+
+def _rows_in_frame(
+    readers: Sequence[ChannelReader], config: ExtractConfig, counts: Counter[str], transforms: LogTransforms
+) -> tuple[dict[str, Positions], Frame]:
+    """The rows of every role, placed in the mission frame and thinned, and that frame."""
+    rows = {role: _columns(role, readers, counts) for role in ROLES}
+    primary = "truth" if config.thinning.enabled and config.thinning.thin_from == "truth" else "detections"
+    _check_any(primary, rows[primary], counts)
+    placing = Placing(config.frame, Limits(config.max_extrapolation_s, config.max_transform_gap_s))
+    rows = bring_together(rows, primary, placing, transforms.read, counts)
+    _check_any(primary, rows[primary], counts)
+    rows = {role: in_enu(positions) for role, positions in rows.items()}
+    frame = mission_frame(rows[primary], [rows[role] for role in ROLES if role != primary], config.datum)
+    for role in ROLES:
+        placed = _placed(role, rows[role], frame, counts, transforms.apart)
+        rows[role] = _without_spikes(placed, config.max_speed_mps, counts)
+    if config.thinning.enabled:
+        rows["detections"] = _thinned(rows[primary], config.thinning)
+        if len(rows["detections"]) == 0:
+            raise InputError("thinning left no detection; choose a smaller extract.thinning.mean_gap_s or another seed")
+    return rows, frame
+
+
+def _columns(role: str, readers: Sequence[ChannelReader], counts: Counter[str]) -> Positions:
+    """All finite rows of a role, sorted by time."""
+    parts = [reader.finish() for reader in readers if reader.role == role]
+    counts["out_of_order"] += sum(int((part.time_ns < np.maximum.accumulate(part.time_ns)).sum()) for part in parts)
+    rows = Positions.concatenate(parts or [Rows().finish()])
+    is_finite = np.isfinite(rows.first) & np.isfinite(rows.second)
+    # A latitude off the earth is as little a position as NaN.
+    is_finite &= ~rows.is_geodetic | ((np.abs(rows.first) <= 90) & (np.abs(rows.second) <= 360))
+    counts["dropped_nonfinite"] += int((~is_finite).sum())
+    rows = rows[is_finite]
+    return rows[np.argsort(rows.time_ns, kind="stable")]
+
+
+def _check_any(role: str, rows: Positions, counts: Counter[str]) -> None:
+    if len(rows):
+        return
+    if counts["no_transform"]:
+        reason = (
+            f"for none of the {role} the log has a transform near enough in time; "
+            "raise extract.max_extrapolation_s and extract.max_transform_gap_s, or check the stamps"
+        )
+    elif counts["dropped_nonfinite"]:
+        reason = "every position is NaN, infinite or off the earth; check the recorder, or map another topic"
+    elif counts["undecodable"]:
+        reason = "no message of the mapped topics can be decoded; map another topic (cadence info lists them)"
+    elif counts["no_fix"]:
+        reason = "every position is marked as having no fix; map another topic (cadence info lists them)"
+    elif counts["incomplete"]:
+        reason = "no message of the mapped topics has a position where the mapping looks for it; correct the [extract] entries"
+    elif counts["outside_time_cut"]:
+        raise NothingDetectedError("no message of the mapped topics lies inside extract.start and extract.end; widen them")
+    else:
+        raise NothingDetectedError(f"the topics mapped as {role} hold no position; map another topic (cadence info lists them)")
+    raise InputError(reason)
+
+
+def _placed(role: str, rows: Positions, frame: Frame, counts: Counter[str], apart: set[str]) -> Positions:
+    """Rows in the mission frame. What the user asked for must fit; what was only suggested is left out and counted.
+
+    The frames of what is left out are added to `apart`.
+    """
+    placed, num_elsewhere = place(rows, frame)
+    if num_elsewhere:
+        geodetic = {"latitude and longitude"} if (rows.is_geodetic & (not frame.is_georeferenced)).any() else set()
+        apart |= geodetic | {str(name) for name in rows.frame_id[~rows.is_geodetic]} - {frame.frame_id, ""}
+    if num_elsewhere and rows.is_stated.any():
+        raise InputError(
+            f"{role}: {num_elsewhere} positions are not in the mission frame {frame.frame_id!r}, and no transform of the log "
+            f"joins them; take those topics out of [[extract.{role}]]"
+        )
+    counts["other_frame"] += num_elsewhere
+    return placed
+
+
+def _without_spikes(rows: Positions, max_speed_mps: float | None, counts: Counter[str]) -> Positions:
+    if max_speed_mps is None:
+        return rows
+    spikes = is_spike(rows, max_speed_mps)
+    counts["spikes"] += int(spikes.sum())
+    return rows[~spikes]
+
+
+def _thinned(rows: Positions, config: ThinningConfig) -> Positions:
+    """The rows that fall into bursts, with noise."""
+    if any(agent is None for agent in rows.agent):
+        raise InputError(
+            "thinning: some detections have no agent; give agent or agent_path, or set extract.thinning.enabled=false"
+        )
+    is_kept = np.zeros(len(rows), dtype=np.bool_)
+    first, second = rows.first.copy(), rows.second.copy()
+    for agent in sorted(set(rows.agent)):
+        of_agent = np.flatnonzero(rows.agent == agent)
+        is_kept[of_agent] = is_seen(rows.time_ns[of_agent], agent, config)
+        if config.noise_m > 0:
+            added = noise(len(of_agent), agent, config)
+            first[of_agent] += added[:, 0]
+            second[of_agent] += added[:, 1]
+    covariance = rows.covariance_m2
+    if config.variance_m2 > 0:
+        covariance = np.nan_to_num(covariance, nan=0.0) + np.array([config.variance_m2, 0.0, config.variance_m2])
+    return replace(rows, first=first, second=second, covariance_m2=covariance)[is_kept]
+
+
+def _with_default_sigma(rows: Positions, sigma_m: float | None) -> Positions:
+    if sigma_m is None:
+        return rows
+    covariance = rows.covariance_m2.copy()
+    covariance[np.isnan(covariance[:, 0])] = (sigma_m**2, 0.0, sigma_m**2)
+    return replace(rows, covariance_m2=covariance)
+
+
+def _without_repeats(rows: Positions) -> tuple[Positions, int]:
+    """Truth with one row an agent and time (the first), and the number of rows left out."""
+    _, agent = np.unique(rows.agent.astype(np.str_), return_inverse=True)
+    _, kept = np.unique(np.column_stack([rows.time_ns, agent]), axis=0, return_index=True)
+    return rows[np.sort(kept)], len(rows) - len(kept)
+
+
+def _detection_table(log_id: str, collapsed: Collapsed) -> pa.Table:
+    rows = collapsed.positions
+    columns = {
+        "log_id": pa.array([log_id] * len(rows)), "time_ns": rows.time_ns, "sensor_id": rows.sensor, "agent_id": rows.agent,
+        "x_m": rows.first, "y_m": rows.second, "z_m": rows.z_m, "cov_xx_m2": rows.covariance_m2[:, 0],
+        "cov_xy_m2": rows.covariance_m2[:, 1], "cov_yy_m2": rows.covariance_m2[:, 2], "score": rows.score,
+        "num_merged": collapsed.num_merged, "topic": rows.topic, "log_time_ns": rows.log_time_ns, "sequence": rows.sequence,
+    }  # fmt: skip
+    return _table(columns, DETECTIONS)
+
+
+def _track_table(log_id: str, rows: Positions, key: str, names: npt.NDArray[np.object_], schema: pa.Schema) -> pa.Table:
+    columns = {
+        "log_id": pa.array([log_id] * len(rows)), "time_ns": rows.time_ns, key: names,
+        "x_m": rows.first, "y_m": rows.second, "z_m": rows.z_m,
+    }  # fmt: skip
+    return _table(columns, schema)
+
+
+def _table(columns: Mapping[str, Any], schema: pa.Schema) -> pa.Table:
+    """NaN becomes null."""
+    return pa.table([pa.array(columns[item.name], type=item.type, from_pandas=True) for item in schema], schema=schema)
+
+
+def _tell(counts: Counter[str], detections: Positions, log: MissionLog, progress: Progress) -> None:
+    """One line for each kind of thing that was left out."""
+    meanings = {
+        "dropped_nonfinite": "positions are NaN, infinite or off the earth and were skipped",
+        "incomplete": "messages have no position where the mapping looks for it and were skipped",
+        "undecodable": "messages cannot be decoded and were skipped",
+        "no_fix": "positions are marked as having no fix and were skipped",
+        "bad_covariance": "covariances are not positive definite and were replaced by the default",
+        "out_of_order": "time stamps were out of order and were sorted",
+        "spikes": "positions lie far off their track (see extract.max_speed_mps) and were skipped",
+        "other_frame": "positions are in another frame than the detections, which no transform joins, and were skipped",
+        "no_transform": "positions have no transform near enough in time (see extract.max_extrapolation_s) and were skipped",
+        "outside_time_cut": "messages lie outside extract.start and extract.end and were not used",
+        "unselected_topics": "topics fit none of extract.topics and were not used",
+    }
+    for name, meaning in meanings.items():
+        if counts[name]:
+            progress.note(f"extract: {counts[name]} {meaning}")
+    apart_s = float(np.median(np.abs(detections.time_ns - detections.log_time_ns))) * 1e-9
+    if apart_s > _STAMPS_APART_S:
+        advice = 'to use the log times give the source time = "log_time"'
+        progress.note(f"extract: stamps and log times are {apart_s:.0f} s apart; the stamps are used; {advice}")
+    for problem in log.health.problems:
+        progress.note(f"extract: {problem}")
+
+
+def _summary(
+    log: MissionLog, readers: Sequence[ChannelReader], detections: Positions, truth: Positions, poses: Positions, frame: Frame,
+    counts: Counter[str], num_obstacles: int,
+) -> dict[str, Any]:  # fmt: skip
+    agents = {agent for agent in detections.agent if agent is not None}
+    span_s = float(detections.time_ns[-1] - detections.time_ns[0]) * 1e-9
+    names = ("undecodable", "incomplete", "no_fix", "dropped_nonfinite", "bad_covariance", "out_of_order", "outside_time_cut")
+    return {
+        "num_detections": len(detections),
+        "num_truth": len(truth),
+        "num_poses": len(poses),
+        "num_obstacles": num_obstacles,
+        "num_agents": len(agents),
+        "num_unknown_origin": sum(agent is None for agent in detections.agent),
+        "span_s": span_s,
+        "frame": {"frame_id": frame.frame_id, "latitude_deg": frame.latitude_deg, "longitude_deg": frame.longitude_deg},
+        "sources": {role: sorted({r.source.topic for r in readers if r.role == role}) for role in ROLES},
+        **{
+            name: counts[name]
+            for name in (*names, "other_frame", "spikes", "collapsed", "duplicate_truth", "unselected_topics")
+        },
+        "lost_spans_ns": [list(span) for span in log.health.lost_spans_ns],
+        "is_complete": log.health.is_complete,
+    }

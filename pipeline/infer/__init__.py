@@ -1,0 +1,1 @@
+"""Stage infer: detections to hypotheses."""

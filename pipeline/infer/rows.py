@@ -1,0 +1,92 @@
+"""Drawn hypotheses as rows of the tables HYPOTHESES and WINDOWS."""
+
+import numpy as np
+import pyarrow as pa
+import torch
+from torch import Tensor
+
+from pipeline.infer.ways import WayWindows
+from pipeline.windows import Grid, MissionWindows
+from schemas.tables import WINDOWS, hypotheses_schema
+
+ADVICE = {
+    "ok": None,
+    "no_detections": "not detected within this window's history; infer.grid.history_steps or step_s would widen it",
+    "infeasible": "no way around an obstacle between detections; check the obstacles, or lower infer.guidance.margin_m",
+    "guidance_diverged": "sampling did not stay finite, so the bank's samples stand in; report this log",
+}
+"""What to do about each status of a window."""
+
+
+def hypothesis_rows(
+    log_id: str, windows: MissionWindows, grid: Grid, part: Tensor, position: Tensor, weight: Tensor
+) -> pa.Table:
+    """HYPOTHESES rows of the active agents, by window, hypothesis, agent."""
+    active = windows.batch.is_active[part]
+    b, k, a, t = position.shape[:4]
+    is_row = active[:, None, :].expand(b, k, a)
+    window, hypothesis, agent = (index.numpy() for index in is_row.nonzero(as_tuple=True))
+    which = part.numpy()[window]
+    flat = pa.array(position[is_row].float().numpy().reshape(-1))
+    pairs = pa.FixedSizeListArray.from_arrays(pa.FixedSizeListArray.from_arrays(flat, 2), t)
+    num = len(window)
+    agents = pa.DictionaryArray.from_arrays(pa.array(agent.astype(np.int32)), pa.array(windows.agent_ids)).cast(pa.string())
+    columns = [
+        pa.array([log_id] * num, pa.string()),
+        pa.array(which.astype(np.int32)),
+        pa.array(windows.origins_ns[which]),
+        pa.array(np.full(num, grid.step_ns)),
+        pa.array(np.full(num, grid.origin_index, dtype=np.int32)),
+        agents,
+        pa.array(hypothesis.astype(np.int32)),
+        pa.array(weight.numpy()[window, hypothesis].astype(np.float32)),
+        pa.array(windows.datum_m[which, 0]),
+        pa.array(windows.datum_m[which, 1]),
+        pairs,
+    ]
+    schema = hypotheses_schema(t)
+    return pa.Table.from_arrays([column.cast(item.type) for column, item in zip(columns, schema, strict=True)], schema=schema)
+
+
+def window_rows(windows: MissionWindows, part: Tensor, position: Tensor, weight: Tensor, status: list[list[str]]) -> pa.Table:
+    """WINDOWS rows of every agent."""
+    spread = _spread_m(position[:, :, :, windows.batch.origin_index], weight)
+    detections = windows.batch.detections[part]
+    age = -torch.where(detections.is_observed, detections.time_s, -torch.inf).amax(-1)
+    rows = []
+    for index, window in enumerate(part.tolist()):
+        for a, agent in enumerate(windows.agent_ids):
+            is_active = bool(detections.is_observed[index, a].any())
+            rows.append(
+                {
+                    "window": window,
+                    "origin_ns": int(windows.origins_ns[window]),
+                    "agent_id": agent,
+                    "status": status[index][a],
+                    "advice": ADVICE[status[index][a]],
+                    "num_detections": int(detections.count[index, a]),
+                    "age_s": float(age[index, a]) if is_active else None,
+                    "spread_m": float(spread[index, a]) if is_active else None,
+                }
+            )
+    return pa.Table.from_pylist(rows, schema=WINDOWS)
+
+
+def with_association(rows: pa.Table, ways: WayWindows, part: Tensor) -> pa.Table:
+    """WINDOWS rows of some windows with what is said of agents whose detections are of unknown origin."""
+    window = part.numpy()
+    for name, value in (("probability", ways.probability), ("association_entropy_bits", ways.entropy_bits)):
+        index = WINDOWS.get_field_index(name)
+        rows = rows.set_column(index, WINDOWS.field(name), pa.array(value[window].reshape(-1), from_pandas=True))
+    return rows
+
+
+def _spread_m(position_m: Tensor, weight: Tensor) -> Tensor:
+    """Spread [B, A] of positions [B, K, A, 2] under weights [B, K]; hypotheses without the agent (NaN) are left out."""
+    is_there = position_m.isfinite().all(-1)
+    share = weight[:, :, None] * is_there
+    # An agent of every hypothesis keeps the weights as they are, to the last bit.
+    share = torch.where(is_there.all(1, keepdim=True), share, share / share.sum(1, keepdim=True))
+    position_m = torch.where(is_there[..., None], position_m, 0.0)
+    mean = (share[..., None] * position_m).sum(1, keepdim=True)
+    return (share * ((position_m - mean) ** 2).sum(-1)).sum(1).sqrt()

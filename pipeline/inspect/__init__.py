@@ -1,0 +1,1 @@
+"""What people want to know of a log before they use it."""

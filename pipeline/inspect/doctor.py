@@ -1,0 +1,184 @@
+"""What is wrong with a log, what can be used of it, and what to do: `cadence doctor`, in plain words."""
+
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+from cadence.errors import CadenceError, InputError, PartialInputError, UsageError
+from pipeline.extract.stage import ExtractConfig, write_tables
+from pipeline.ingest.stage import survey_channels
+from pipeline.inspect.log_times import time_remarks
+from pipeline.logs.container import container_remarks
+from pipeline.logs.health import utc
+from pipeline.logs.reader import MissionLog, open_parts
+from pipeline.missions import find_missions
+from pipeline.progress import Progress
+from pipeline.stores.urls import is_url
+
+Verdict = Literal["sound", "faulty", "partial", "unusable"]
+_MEANING: Mapping[Verdict, str] = {
+    "sound": "SOUND",
+    "faulty": "ALL MESSAGES CAN BE READ, but the file is damaged",
+    "partial": "PARTIAL: messages are lost, or may be",
+    "unusable": "UNUSABLE",
+}
+_LEFT_OUT = {
+    "undecodable": "messages cannot be decoded",
+    "incomplete": "messages have no position where it is looked for",
+    "no_fix": "positions are marked as having no fix",
+    "dropped_nonfinite": "positions are NaN, infinite or off the earth",
+    "spikes": "positions lie far off their track",
+    "other_frame": "positions are in another frame that no transform joins",
+    "bad_covariance": "covariances are not positive definite",
+}
+_ADVICE = {
+    "copy": "If there is another copy of the recording, use that one: what is lost here may be whole there.",
+    "as it is": "`cadence run` works on the damaged log as it is: it takes what is sound, and lost spans are gaps.",
+    "recorder": "Let the recorder write checksums and an index (most do unless told otherwise), and end it in good order.",
+    "clock": "Check the recorder's clock; a source with time = \"publish_time\" or a stamp's path uses another one.",
+    "schema": "Channels that cannot be decoded are left out; to use one, record it with its schema in a known encoding.",
+}
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """What `diagnose` found in one log; times are log times, sentences are for people.
+
+    verdict      sound; faulty: every message can be read, though the file is damaged; partial: messages are lost or may be;
+                 unusable: no message can be read
+    num_messages_expected  None where nothing in the file says so
+    lost_spans_ns          first and last log time of stretches in which messages are lost, as far as they are known
+    problems     damage, by the walk over the file
+    container    what the file lacks without loss: index, statistics, checksums, order of its chunks
+    clocks, gaps what is odd about the times; when nothing was recorded
+    undecodable  channels that cannot be decoded, and why
+    use          what `cadence run` would take from the log without any settings
+    no_use       why it would take nothing; empty where it would
+    advice       what to do
+    """
+
+    log: str
+    verdict: Verdict
+    num_messages: int = 0
+    num_messages_expected: int | None = None
+    start_ns: int = 0
+    end_ns: int = 0
+    lost_spans_ns: tuple[tuple[int, int], ...] = ()
+    problems: tuple[str, ...] = ()
+    container: tuple[str, ...] = ()
+    clocks: tuple[str, ...] = ()
+    gaps: tuple[str, ...] = ()
+    undecodable: tuple[str, ...] = ()
+    use: Mapping[str, Any] = field(default_factory=dict)
+    no_use: str = ""
+    advice: tuple[str, ...] = ()
+
+
+def diagnose_all(logs: Sequence[str], progress: Progress) -> tuple[Diagnosis, ...]:
+    """The diagnoses of files, folders and patterns of them; the parts of a split recording are one log.
+
+    `UsageError` for URLs, `InputError` where a folder or a pattern holds no log.
+    """
+    if any(is_url(log) for log in logs):
+        raise UsageError("cadence doctor reads local files; copy the log here, or let `cadence run` fetch it")
+    return tuple(diagnose([Path(part) for part in mission.parts], progress) for mission in find_missions(logs, ""))
+
+
+def diagnose(parts: Sequence[Path], progress: Progress) -> Diagnosis:
+    """The diagnosis of a log, which may lie in several files. Nothing that is in them makes it raise."""
+    name = str(parts[0]) if len(parts) == 1 else f"{parts[0]} and {len(parts) - 1} more parts"
+    try:
+        size = sum(part.stat().st_size for part in parts if part.is_file())
+        with progress.bar(size, f"check {parts[0].name}", unit="B", scale=True) as bar:
+            log = open_parts(parts, bar.update)
+        if not log.health.num_messages:
+            return _unusable(name, log.health.problems or ("The file holds no message.",))
+        return _of(name, log)
+    except InputError as error:
+        return _unusable(name, (str(error),))
+
+
+def exit_code(diagnoses: Sequence[Diagnosis]) -> int:
+    """0 where every message of every log can be read; of the others an unusable log counts more than a partial one."""
+    verdicts = {diagnosis.verdict for diagnosis in diagnoses}
+    if "unusable" in verdicts:
+        return InputError.exit_code
+    return PartialInputError.exit_code if "partial" in verdicts else 0
+
+
+def render(diagnosis: Diagnosis) -> str:
+    """The diagnosis as text."""
+    lines = [f"{diagnosis.log}: {_MEANING[diagnosis.verdict]}"]
+    if diagnosis.num_messages:
+        of = "" if diagnosis.num_messages_expected is None else f" of {diagnosis.num_messages_expected}"
+        span = f"{utc(diagnosis.start_ns)} to {utc(diagnosis.end_ns)}"
+        lines.append(f"  {diagnosis.num_messages}{of} messages can be read, {span}")
+    titles = {
+        "problems": "What is wrong", "container": "Container", "clocks": "Clocks", "gaps": "Gaps",
+        "undecodable": "Channels that cannot be decoded",
+    }  # fmt: skip
+    for name, title in titles.items():
+        if getattr(diagnosis, name):
+            lines += [f"{title}:", *(f"  {sentence}" for sentence in getattr(diagnosis, name))]
+    if diagnosis.use or diagnosis.no_use:
+        lines += ["What `cadence run` would use:", *(f"  {line}" for line in _use_lines(diagnosis))]
+    if diagnosis.advice:
+        lines += ["What to do:", *(f"  {sentence}" for sentence in diagnosis.advice)]
+    return "\n".join(lines)
+
+
+def _unusable(name: str, problems: tuple[str, ...]) -> Diagnosis:
+    return Diagnosis(name, "unusable", problems=problems, advice=(_ADVICE["copy"],))
+
+
+def _of(name: str, log: MissionLog) -> Diagnosis:
+    """The diagnosis of a log with messages."""
+    health, times = log.health, time_remarks(log)
+    container = [remark for part in log.parts for remark in container_remarks(part)]
+    if not health.has_checksums:
+        container.append("Some chunks have no checksum: changed bytes inside messages could not be noticed.")
+    undecodable = tuple(channel.reason for channel in survey_channels(log) if channel.reason)
+    use, no_use = _use_of(log)
+    verdict: Verdict = "partial" if not health.is_complete else "faulty" if health.problems else "sound"
+    reasons = {
+        "copy": not health.is_complete,
+        "as it is": not health.is_complete and not no_use,
+        "recorder": bool(container) or bool(health.problems and health.is_complete),
+        "clock": bool(times.clocks),
+        "schema": bool(undecodable),
+    }
+    return Diagnosis(
+        name, verdict, health.num_messages, health.num_messages_expected, log.start_ns, log.end_ns, health.lost_spans_ns,
+        health.problems, tuple(container), times.clocks, times.gaps, undecodable, use, no_use,
+        tuple(_ADVICE[name] for name, applies in reasons.items() if applies),
+    )  # fmt: skip
+
+
+def _use_of(log: MissionLog) -> tuple[Mapping[str, Any], str]:
+    """What the stage extract makes of the log by default, and why it makes nothing."""
+    with tempfile.TemporaryDirectory() as folder:
+        try:
+            return write_tables(log, Path(folder), ExtractConfig(), Progress(quiet=True)), ""
+        except CadenceError as error:
+            return {}, str(error).removeprefix(f"{log.path}: ")
+
+
+def _use_lines(diagnosis: Diagnosis) -> list[str]:
+    if diagnosis.no_use:
+        return [f"nothing: {diagnosis.no_use}"]
+    use = diagnosis.use
+    agents = f"{use['num_agents']} agents" if use["num_agents"] else "agents that are not named"
+    counts = [f"{use['num_detections']} detections of {agents}{_topics(use, 'detections')}"]
+    if use["num_unknown_origin"] and use["num_agents"]:
+        counts.append(f"{use['num_unknown_origin']} of them do not say which agent they are of")
+    for role, name in (("truth", "num_truth"), ("poses", "num_poses")):
+        if use[name]:
+            counts.append(f"{use[name]} positions of {role}{_topics(use, role)}")
+    return counts + [f"left out: {use[name]} {words}" for name, words in _LEFT_OUT.items() if use[name]]
+
+
+def _topics(use: Mapping[str, Any], role: str) -> str:
+    topics = use["sources"][role]
+    return f" from {', '.join(topics[:4])}{' and others' if len(topics) > 4 else ''}" if topics else ""

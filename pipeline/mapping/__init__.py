@@ -1,0 +1,1 @@
+"""What channels and message types mean, by guess or as the user states."""

@@ -1,0 +1,181 @@
+"""What the channels of a log look like: roles by the words of their names and by their schemas, and sources ready to use.
+
+The suggestion is shown by `cadence info` and used by `extract` for every role that the user leaves unconfigured.
+"""
+
+import itertools
+import json
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Final, Literal
+
+from pipeline.mapping.presets import NAMES_AGENTS, normalise_schema, preset_for
+from pipeline.mapping.sources import ChannelLike, SourceConfig
+
+Role = Literal["detections", "truth", "poses", "positions", "tf", "obstacles"]
+"""`positions` are positions whose name does not tell of what; `tf` and `obstacles` have readers of their own."""
+
+_TRUTH = {"truth", "groundtruth", "gt", "mocap", "vicon", "optitrack", "qualisys"}
+_DETECTION = {
+    "contact", "contacts", "detection", "detections", "detected", "track", "tracks", "target", "targets", "sighting",
+    "sightings", "observation", "observations", "measurement", "measurements", "ais", "adsb", "radar", "report", "reports",
+}  # fmt: skip
+_POSE = {
+    "pose", "poses", "odom", "odometry", "fix", "gps", "gnss", "navsat", "location", "position", "tracker", "trackers",
+    "sensor", "sensors", "ownship", "own", "ego", "platform", "platforms", "observer", "observers",
+}  # fmt: skip
+_KNOWN: Final = _TRUTH | _DETECTION | _POSE | {"ground"}
+_OBSTACLE = {"obstacle", "obstacles", "map", "costmap", "grid", "keepout", "nogo"}
+_TF_SCHEMAS = {"TFMessage", "tfMessage", "TransformStamped", "FrameTransform", "FrameTransforms"}
+_OBSTACLE_SCHEMAS = {"OccupancyGrid", "Grid", "GeoJSON"}
+OWN_TOPICS = "/cadence/"
+"""What an earlier run wrote into a combined file is never an input."""
+# Without a preset only a name as plain as this makes a detection: /radar/image or /battery/report are none.
+_PLAIN_DETECTION = {"contact", "contacts", "detection", "detections", "target", "targets", "sighting", "sightings"}
+_NEVER_POSITIONS = {"std_msgs", "sensor_msgs", "rcl_interfaces", "diagnostic_msgs", "visualization_msgs"}
+
+
+@dataclass(frozen=True)
+class SuggestedMapping:
+    """What the channels look like. `roles` maps topics to roles; the sources hold only channels with a preset."""
+
+    roles: Mapping[str, Role]
+    detections: tuple[SourceConfig, ...] = ()
+    truth: tuple[SourceConfig, ...] = ()
+    poses: tuple[SourceConfig, ...] = ()
+    positions: tuple[SourceConfig, ...] = ()
+
+    def to_toml(self) -> str:
+        """The `[extract]` lines of this mapping, ready to paste; what needs a decision is a comment."""
+        blocks = [_entry(role, source) for role in ("detections", "truth", "poses") for source in getattr(self, role)]
+        for source in self.positions:
+            comment = "a position, but the name does not tell of what: make it detections, truth or poses"
+            blocks.append("# " + f"{comment}\n{_entry('detections', source)}".replace("\n", "\n# "))
+        for topic, role in self.roles.items():
+            if role == "detections" and not any(source.match(topic) is not None for source in self.detections):
+                entry = _entry("detections", SourceConfig(topic, x="position.x", y="position.y"))
+                blocks.append("# " + f"no preset knows its schema: give the paths of its fields\n{entry}".replace("\n", "\n# "))
+        if blocks and not self.detections:
+            blocks.append("# to make sparse detections out of the dense channel:\n# [extract.thinning]\n# enabled = true")
+        return "\n\n".join(blocks) + ("\n" if blocks else "")
+
+
+def suggest_mapping(channels: Sequence[ChannelLike]) -> SuggestedMapping:
+    """The roles that names and schemas suggest, and sources for the channels that have messages and a preset."""
+    roles = {channel.topic: role for channel in channels if (role := _role(channel)) is not None}
+
+    def readable(role: Role) -> list[ChannelLike]:
+        return [c for c in channels if roles.get(c.topic) == role and preset_for(c.schema_name) and c.message_count != 0]
+
+    return SuggestedMapping(
+        roles,
+        detections=_name_only_agent(_sources(readable("detections"), "detections"), readable("detections"), readable("truth")),
+        truth=_sources(readable("truth"), "truth"),
+        poses=_sources(readable("poses"), "poses"),
+        positions=_sources(readable("positions"), "positions"),
+    )
+
+
+def dense_sources(channels: Sequence[ChannelLike], suggested: SuggestedMapping) -> tuple[SourceConfig, ...]:
+    """Poses and positions as sources of truth, for a log whose only position channel is the one to thin."""
+    usable = [c for c in channels if suggested.roles.get(c.topic) in ("poses", "positions") and preset_for(c.schema_name)]
+    return _sources([c for c in usable if c.message_count != 0], "truth")
+
+
+def describe_channels(channels: Iterable[ChannelLike]) -> str:
+    """`/a (Type), /b (Type)` for messages, cut after eight."""
+    named = [f"{channel.topic} ({channel.schema_name or 'no schema'})" for channel in channels]
+    rest = f" and {len(named) - 8} more" if len(named) > 8 else ""
+    return ", ".join(named[:8]) + rest if named else "none"
+
+
+def _words(topic: str) -> list[str]:
+    spaced = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", " ", topic)
+    return [word.lower() for word in re.split(r"[^A-Za-z0-9]+", spaced) if word]
+
+
+def _role(channel: ChannelLike) -> Role | None:
+    """Schema first, then the words of the name; truth before detection, detection before pose (`/truth/target/pose`)."""
+    package, _, kind = normalise_schema(channel.schema_name).rpartition(".")
+    words, preset = _words(channel.topic), preset_for(channel.schema_name)
+    if kind in _TF_SCHEMAS:
+        return "tf"
+    if kind in _OBSTACLE_SCHEMAS or (preset == "SceneUpdate" and _OBSTACLE.intersection(words)):
+        return "obstacles"
+    if channel.topic.startswith(OWN_TOPICS):
+        return None
+    if preset is None:
+        if _PLAIN_DETECTION.intersection(words) and package not in _NEVER_POSITIONS:
+            return "detections"
+        return "obstacles" if _OBSTACLE.intersection(words) and package not in _NEVER_POSITIONS else None
+    if _TRUTH.intersection(words) or ("ground", "truth") in itertools.pairwise(words):
+        return "truth"
+    if _DETECTION.intersection(words) or preset == "Detection" or (preset in NAMES_AGENTS and preset != "SceneUpdate"):
+        return "detections"
+    if preset == "SceneUpdate":
+        return None  # a scene without such a name may show anything
+    return "poses" if _POSE.intersection(words) else "positions"
+
+
+def _sources(channels: Sequence[ChannelLike], role: Role) -> tuple[SourceConfig, ...]:
+    """One source a pattern: topics of one preset that differ only in a name share it."""
+    topics = [channel.topic for channel in channels]
+    found = {(_pattern(c.topic, role, topics), preset_for(c.schema_name)): None for c in channels}
+    return tuple(SourceConfig(pattern, preset=preset) for pattern, preset in found)
+
+
+def _pattern(topic: str, role: Role, topics: Sequence[str]) -> str:
+    """Put placeholders where names stand beside words of roles.
+
+    /truth/A7 → /truth/{agent}, /cub1/pose → /{agent}/pose; of a detection the name before the word is who sees, the name
+    after it who is seen: /camera/contacts/A7 → /{sensor}/contacts/{agent}. Names in `topics` tell which part varies.
+    """
+    parts = topic.split("/")
+    is_word = [bool(part) and not _KNOWN.isdisjoint(_words(part)) for part in parts]
+    names = [i for i, part in enumerate(parts) if part and not is_word[i]]
+    if not any(is_word) or not names:
+        return topic
+    varying = _varying(parts, names, topics)
+    if role == "detections":
+        word = max(i for i, known in enumerate(is_word) if known)
+        for placeholder, places in (("sensor", [i for i in names if i < word]), ("agent", [i for i in names if i > word])):
+            if places:
+                parts[next((i for i in reversed(places) if i in varying), places[-1])] = f"{{{placeholder}}}"
+    else:
+        parts[varying[-1] if varying else names[-1]] = "{sensor}" if role == "poses" else "{agent}"
+    return "/".join(parts)
+
+
+def _varying(parts: Sequence[str], names: Sequence[int], topics: Sequence[str]) -> list[int]:
+    """The places of `names` in which some other topic differs from this one, and in no other part."""
+    found: set[int] = set()
+    for other in (topic.split("/") for topic in topics):
+        if len(other) == len(parts):
+            different = [i for i, (mine, its) in enumerate(zip(parts, other, strict=True)) if mine != its]
+            found.update(different if len(different) == 1 else ())
+    return [i for i in names if i in found]
+
+
+def _name_only_agent(
+    detections: tuple[SourceConfig, ...], channels: Sequence[ChannelLike], truth: Sequence[ChannelLike]
+) -> tuple[SourceConfig, ...]:
+    """Detections without identity are of the only agent that the log's truth knows, where that is only one."""
+    named = [
+        found.get("agent", c.topic.strip("/"))
+        for source in _sources(truth, "truth")
+        for c in truth
+        if (found := source.match(c.topic))
+    ]
+    if len(truth) != 1 or len(named) != 1:
+        return detections
+    identified = {c.topic for c in channels if b"agent_id" in c.schema_data or preset_for(c.schema_name) in NAMES_AGENTS}
+    is_named = [source.topic in identified or "{agent}" in source.topic for source in detections]
+    return tuple(s if known else replace(s, agent=named[0]) for s, known in zip(detections, is_named, strict=True))
+
+
+def _entry(role: str, source: SourceConfig) -> str:
+    lines = [f"[[extract.{role}]]"]
+    stated = {item.name: getattr(source, item.name) for item in fields(source)}
+    lines += [f"{name} = {json.dumps(value)}" for name, value in stated.items() if value is not None]
+    return "\n".join(lines)

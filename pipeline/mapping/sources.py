@@ -1,0 +1,138 @@
+"""Sources: which topic and which of its fields hold detections, truth or poses, as the user configures them."""
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Literal, Protocol
+
+from cadence.errors import ConfigError
+from pipeline.mapping.message_path import parse_path
+from pipeline.mapping.presets import FRAME_PATHS, PRESETS, TIME_PATHS, Preset, preset_for
+
+PLACEHOLDERS = ("agent", "sensor")
+LOG_TIME = "log_time"
+PUBLISH_TIME = "publish_time"
+
+PATH_KEYS = {"agent": "agent_path", "sensor": "sensor_path"}
+"""The keys of a source that state a message path under another name than the preset's field; all others are named alike."""
+
+_CHECKED = (
+    "agent_path", "sensor_path", "x", "y", "z", "latitude", "longitude", "altitude", "covariance", "score", "time", "frame_id",
+)  # fmt: skip
+
+
+class ChannelLike(Protocol):
+    """What a mapping needs to know of a channel (`pipeline.logs.reader.Channel` has more)."""
+
+    @property
+    def topic(self) -> str: ...  # noqa: D102
+    @property
+    def schema_name(self) -> str: ...  # noqa: D102
+    @property
+    def schema_data(self) -> bytes: ...  # noqa: D102
+    @property
+    def message_count(self) -> int | None: ...  # noqa: D102
+
+
+@dataclass(frozen=True)
+class SourceConfig:
+    """One `[[extract.detections]]`, `[[extract.truth]]` or `[[extract.poses]]` entry.
+
+    topic       exact, or with `{agent}` and/or `{sensor}` in place of a part of a name (`/truth/{agent}`)
+    preset      a name of `pipeline.mapping.presets`; without one and without paths it is chosen by the schema
+    agent, agent_path    who was seen: a constant, or a message path; neither (nor `{agent}`) means origin unknown
+    sensor, sensor_path  who saw it
+    x, y, z     message paths of a position in metres
+    latitude, longitude, altitude   message paths of a position in degrees (and metres), instead of x, y and z
+    covariance  message path of 1, 4, 9 or 36 numbers (a variance, or rows of a matrix) or 6 (an upper triangle), x first, m²
+    sigma_m     standard deviation of x and y where the message states no covariance
+    score       message path of a confidence
+    time        message path of a stamp, or "log_time" or "publish_time"; default: the header's stamp, else the log time
+    frame_id    message path of the frame's name; default: the header's
+    frame_convention   axes of x, y and z, after transforms: "enu" (east, north, up) or "ned" (north, east, down)
+    """
+
+    topic: str
+    preset: str | None = None
+    agent: str | None = None
+    agent_path: str | None = None
+    sensor: str | None = None
+    sensor_path: str | None = None
+    x: str | None = None
+    y: str | None = None
+    z: str | None = None
+    latitude: str | None = None
+    longitude: str | None = None
+    altitude: str | None = None
+    covariance: str | None = None
+    sigma_m: float | None = None
+    score: str | None = None
+    time: str | None = None
+    frame_id: str | None = None
+    frame_convention: Literal["enu", "ned"] = "enu"
+
+    def __post_init__(self) -> None:
+        if self.preset is not None and self.preset not in PRESETS:
+            raise ValueError(f"preset {self.preset!r} is not known; known: {', '.join(PRESETS)}")
+        for name in _CHECKED:
+            text = getattr(self, name)
+            if text is not None and text not in (LOG_TIME, PUBLISH_TIME):
+                _check_path(name, self.without_topic(text))
+        if self.sigma_m is not None and not 0 < self.sigma_m < float("inf"):
+            raise ValueError(f"topic {self.topic!r}: sigma_m must be positive")
+        self._check_position()
+        self._check_identity()
+
+    def _check_position(self) -> None:
+        if (self.x is None) != (self.y is None) or (self.latitude is None) != (self.longitude is None):
+            raise ValueError(f"topic {self.topic!r}: x and y (or latitude and longitude) go together")
+        if self.x is not None and self.latitude is not None:
+            raise ValueError(f"topic {self.topic!r}: give x and y, or latitude and longitude, not both")
+
+    def _check_identity(self) -> None:
+        found = re.findall(r"\{(.*?)\}", self.topic)
+        if any(name not in PLACEHOLDERS for name in found) or len(set(found)) < len(found):
+            raise ValueError(f"topic {self.topic!r}: the placeholders are {{agent}} and {{sensor}}, each once")
+        for name in PLACEHOLDERS:
+            given = [key for key in (name, f"{name}_path") if getattr(self, key) is not None]
+            given += [f"{{{name}}} in the topic"] if name in found else []
+            if len(given) > 1:
+                raise ValueError(f"topic {self.topic!r}: give only one of {', '.join(given)}")
+
+    def without_topic(self, path: str) -> str:
+        """A message path as it is written in Foxglove, less the topic; one without topic as it is."""
+        return path[len(self.topic) :] if path.startswith((f"{self.topic}.", f"{self.topic}{{")) else path
+
+    def match(self, topic: str) -> Mapping[str, str] | None:
+        """The placeholders' values where `topic` is meant (empty without placeholders); None where it is not."""
+        parts = re.split(r"\{(agent|sensor)\}", self.topic)
+        pattern = "".join(f"(?P<{part}>[^/]+)" if i % 2 else re.escape(part) for i, part in enumerate(parts))
+        found = re.fullmatch(pattern, topic)
+        return None if found is None else found.groupdict()
+
+
+def resolve_paths(source: SourceConfig, schema_name: str) -> Preset:
+    """The message paths for a schema: what the source states over its preset; `ConfigError` where there is no position."""
+    is_custom = source.x is not None or source.latitude is not None
+    name = source.preset if source.preset is not None or is_custom else preset_for(schema_name)
+    if name is None and not is_custom:
+        raise ConfigError(
+            f"topic {source.topic}: no preset for the schema {schema_name or '(none)'}; "
+            "give message paths in its [extract] entry: x and y, or latitude and longitude"
+        )
+    base = PRESETS[name] if name is not None else Preset((), time=TIME_PATHS, frame_id=FRAME_PATHS)
+    if is_custom:  # another position must not take height or covariance from the preset's
+        base = Preset((), time=base.time, frame_id=base.frame_id, agent=base.agent, sensor=base.sensor, score=base.score)
+    paths = {item.name: getattr(base, item.name) for item in fields(Preset)}
+    for name_of_path in paths:
+        stated = getattr(source, PATH_KEYS.get(name_of_path, name_of_path), None)
+        if stated is not None:
+            paths[name_of_path] = (source.without_topic(stated),)
+    return Preset(**paths)
+
+
+def _check_path(name: str, text: str) -> None:
+    try:
+        parse_path(text)
+    except ValueError as error:
+        raise ValueError(f"{name}: {error}") from error

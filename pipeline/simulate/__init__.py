@@ -1,0 +1,1 @@
+"""Stage simulate: mission logs out of simulated worlds."""

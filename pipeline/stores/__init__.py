@@ -1,0 +1,1 @@
+"""Buckets and web servers as places of logs and results."""

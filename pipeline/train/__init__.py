@@ -1,0 +1,1 @@
+"""Stage train: from episodes or synthetic motion to a checkpoint."""

@@ -1,0 +1,364 @@
+"""Training of the paper's preset: windows in absolute coordinates from episodes of one target, logs or the simulator."""
+
+import dataclasses
+import functools
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor, nn
+
+from cadence.bank.rows import active_rows
+from cadence.diffusion.absolute import AbsoluteConfig, detection_rows
+from cadence.errors import ConfigError, InputError
+from cadence.network.trajectory import TrajectoryNetwork, TrajectoryNetworkConfig
+from cadence.training.absolute import AbsoluteWindows, absolute_loss, forecast_rows, join_absolute
+from cadence.training.loop import Loss, Trainer
+from cadence.worlds.patrol import PatrolConfig, simulate_patrol
+from cadence.worlds.recordings import NUM_STEPS, Int64s, Recordings, cut_windows
+from pipeline.episodes.pool import EpisodeSource, load_pool
+from pipeline.manifest import StageResult
+from pipeline.progress import Progress
+from pipeline.train.missions import TrainingMission, mission_of_episode, missions_of_logs
+from pipeline.train.run import TrainingRun, run_training
+from pipeline.windows import Float64s, Grid, MissionWindows, build_windows, truth_on_grid
+
+if TYPE_CHECKING:
+    from pipeline.train.stage import TrainConfig
+
+_VALIDATION_SEED_OFFSET = 500_009
+_STEPS_AN_EPISODE = 10
+"""A new simulated episode joins after this many steps, so that simulating does not hold up the start."""
+_FIRST_EPISODES = 8
+_MARGIN = 1.02
+"""Map limits taken from the truth get this much room."""
+
+
+def _patrol() -> PatrolConfig:
+    return PatrolConfig(duration_s=21_600.0, step_s=30.0)
+
+
+@dataclass(frozen=True)
+class AbsoluteTraining:
+    """What the paper's preset is trained on.
+
+    network        the paper's by default
+    step_s         seconds between steps
+    history_steps  steps up to and including the origin: 1 in the paper, which predicts only
+    context_steps  detections from this many steps before the origin on are read
+    relative       positions about the last detection instead of the map's centre
+    clip           clean estimates are clamped to it when sampling, in units of half the map
+    centre_m, scale_m  the map's centre and half its side; by default from the truth of the training logs
+    num_windows    random windows of each episode
+    parked_tail    after the end of its truth an agent stays where it was (the paper); otherwise those steps do not count
+    max_gap_steps  truth is interpolated between samples that are no further apart
+    validation_share  of the logs, whole ones; at least one
+    num_episodes, num_validation_episodes  of the simulator
+    patrol         the simulator's settings
+    sources        episodes of one target to train on, in place of logs and patrol: any number of windows, as in the paper
+                   with the first position as a detection and the target parked after the end
+    validation     episodes to validate on; without them the last ones of each source (validation_share)
+    num_validation_windows  of each source
+    hidden_goals   share of the windows of `sources` whose known goal is hidden, for networks with known_goal; more than 0
+                   makes a checkpoint that serves with and without
+    """
+
+    network: TrajectoryNetworkConfig = field(default_factory=TrajectoryNetworkConfig)
+    step_s: float = 60.0
+    history_steps: int = 1
+    context_steps: int = 4320
+    relative: bool = False
+    clip: float = 1.0
+    centre_m: tuple[float, float] | None = None
+    scale_m: float | None = None
+    num_windows: int = 64
+    parked_tail: bool = True
+    max_gap_steps: float = 2.0
+    validation_share: float = 0.1
+    num_episodes: int = 400
+    num_validation_episodes: int = 16
+    patrol: PatrolConfig = field(default_factory=_patrol)
+    sources: tuple[EpisodeSource, ...] = ()
+    validation: tuple[EpisodeSource, ...] = ()
+    num_validation_windows: int = 1000
+    hidden_goals: float = 0.0
+
+    def __post_init__(self) -> None:
+        self.model_config((0.0, 0.0), self.scale_m or 1.0)  # refuses what cannot be
+        if min(self.num_windows, self.num_episodes, self.num_validation_episodes, self.num_validation_windows) < 1:
+            raise ValueError("num_windows, num_episodes, num_validation_episodes and num_validation_windows must be at least 1")
+        if not 0 < self.validation_share < 1 or not self.max_gap_steps > 0 or self.context_steps < self.history_steps:
+            raise ValueError("validation_share must lie in 0 ... 1, max_gap_steps be positive, context_steps reach the history")
+        if self.network.known_goal and not self.sources:
+            raise ValueError("network.known_goal: only episodes of `sources` say where the goal is; train without it")
+        if self.validation and not self.sources:
+            raise ValueError("validation goes with sources; logs and patrol keep some of their own episodes for it")
+        if self.sources and (self.network.num_steps, self.history_steps) != (NUM_STEPS, 1):
+            raise ValueError(f"windows of sources have {NUM_STEPS} steps from now on: network.num_steps, history_steps = 1")
+        if not 0 <= self.hidden_goals <= 1:
+            raise ValueError("hidden_goals must lie in 0 ... 1")
+        if self.network.elapsed and self.relative:
+            raise ValueError("network.elapsed needs the time since the mission's start, which a relative model does not have")
+
+    def model_config(self, centre_m: tuple[float, float], scale_m: float) -> AbsoluteConfig:
+        """The checkpoint's configuration for these map limits."""
+        return AbsoluteConfig(
+            self.network,
+            self.step_s,
+            self.history_steps,
+            centre_m,
+            scale_m,
+            self.relative,
+            self.clip,
+            float(self.context_steps),
+            self.network.known_goal and self.hidden_goals > 0,
+        )
+
+
+def train_absolute(out: Path, config: "TrainConfig", progress: Progress, force: bool = False) -> StageResult:
+    """Train the paper's preset into `out`; see `pipeline.train.stage.train`.
+
+    From `config.paper.sources`, or else from the logs in `config.data`, or without these from the simulator.
+    """
+    source = _source(out, config, progress)
+    with torch.random.fork_rng(devices=[]):  # layers take their first weights from the global stream, which is left as it was
+        torch.random.manual_seed(config.seed)
+        trainer = Trainer(TrajectoryNetwork(config.paper.network), config.optimiser)
+    schedule = config.paper.network.schedule()
+
+    def loss_at(step: int) -> Loss:
+        generator = torch.Generator().manual_seed(config.seed * 7_919 + step)
+        windows = source.batch(step, config.batch_size, generator)
+        return functools.partial(_loss, windows=windows, generator=generator)
+
+    def _loss(network: nn.Module, windows: AbsoluteWindows, generator: torch.Generator) -> Tensor:
+        assert isinstance(network, TrajectoryNetwork)
+        return absolute_loss(network, windows, schedule, generator)
+
+    @torch.no_grad()
+    def validate(network: nn.Module) -> float:
+        generator = torch.Generator().manual_seed(1)
+        windows = source.validation
+        parts = [windows[begin : begin + 256] for begin in range(0, len(windows), 256)]
+        return sum(float(_loss(network, part, generator)) * len(part) for part in parts) / len(windows)
+
+    run = TrainingRun(out, "paper", config, source.model, config.optimiser.num_steps)
+    return run_training(run, trainer, loss_at, validate, progress, force)
+
+
+class _Source(Protocol):
+    """Where batches come from."""
+
+    model: AbsoluteConfig
+    validation: AbsoluteWindows
+
+    def batch(self, step: int, size: int, generator: torch.Generator) -> AbsoluteWindows:
+        """The windows of a step, which depend on nothing but it and the generator."""
+        ...
+
+
+def _source(out: Path, config: "TrainConfig", progress: Progress) -> _Source:
+    if config.paper.sources:
+        if config.data is not None:
+            raise ConfigError("train.data and train.paper.sources: both say what to train on; give one of them")
+        return _EpisodeSource(out / "episodes", config, progress)
+    return _LogSource(out, config, progress) if config.data is not None else _PatrolSource(config)
+
+
+class _EpisodeSource:
+    """Windows cut out of episodes of one target when they are needed, every step of every episode equally likely."""
+
+    def __init__(self, cache: Path, config: "TrainConfig", progress: Progress) -> None:
+        paper = config.paper
+        load = functools.partial(load_pool, cache=cache, step_s=paper.step_s, where="train.paper", progress=progress)
+        self.pool, self.paper, self.seed = load(paper.sources), paper, config.seed
+        if paper.validation:
+            held_out = load(paper.validation)
+        else:
+            self.pool, held_out = self.pool.split(paper.validation_share)
+        self.model = paper.model_config(*_map_limits(paper, [part.position_m.T for part in self.pool.parts]))
+        drawn = held_out.rows_of_each(paper.num_validation_windows, np.random.default_rng([config.seed, 1, 2]))
+        windows = join_absolute([self._cut(part, rows) for part, rows in drawn])
+        self.validation = self._hidden(windows, torch.Generator().manual_seed(config.seed))
+
+    def batch(self, step: int, size: int, generator: torch.Generator) -> AbsoluteWindows:
+        rng = np.random.default_rng([self.seed, step])
+        return self._hidden(join_absolute([self._cut(part, rows) for part, rows in self.pool.rows(size, rng)]), generator)
+
+    def _cut(self, part: Recordings, rows: Int64s) -> AbsoluteWindows:
+        episode = np.searchsorted(part.offset, rows, side="right") - 1
+        keep = self.model.network.max_detections
+        cut = cut_windows(part, episode, rows - part.offset[episode], num_detections=keep, num_tracker_steps=1)
+        return forecast_rows(cut, self.model)
+
+    def _hidden(self, windows: AbsoluteWindows, generator: torch.Generator) -> AbsoluteWindows:
+        """Some of the windows are not told the goal."""
+        if not self.model.optional_goal or windows.extra is None:
+            return windows
+        is_hidden = torch.rand(len(windows), 1, generator=generator) < self.paper.hidden_goals
+        extra = torch.cat([windows.extra[:, :2].masked_fill(is_hidden, 0.0), windows.extra[:, 2:]], dim=1)
+        return dataclasses.replace(windows, extra=extra)
+
+
+class _LogSource:
+    """Windows of a folder of logs; some of the logs, whole, are for validation."""
+
+    def __init__(self, out: Path, config: "TrainConfig", progress: Progress) -> None:
+        assert config.data is not None
+        paper = config.paper
+        missions = missions_of_logs(config.data, out / "logs", config.extract, progress)
+        if len(missions) < 2:
+            raise InputError(f"{config.data}: one usable log; at least two are needed, as whole logs are kept for validation")
+        order = np.random.default_rng([config.seed, 1]).permutation(len(missions))
+        num_validation = min(max(1, round(paper.validation_share * len(missions))), len(missions) - 1)
+        kept = [missions[index] for index in sorted(order[num_validation:])]
+        held_out = [missions[index] for index in sorted(order[:num_validation])]
+        places = [np.stack([mission.truth[name].to_numpy() for name in ("x_m", "y_m")]) for mission in kept]
+        self.model = paper.model_config(*_map_limits(paper, places))
+        make = functools.partial(mission_windows, training=paper, model=self.model)
+        self.windows = _joined([make(mission, seed=config.seed + i) for i, mission in enumerate(kept)], config.data)
+        offset = config.seed + _VALIDATION_SEED_OFFSET
+        self.validation = _joined([make(mission, seed=offset + i) for i, mission in enumerate(held_out)], config.data)
+
+    def batch(self, step: int, size: int, generator: torch.Generator) -> AbsoluteWindows:
+        return self.windows[torch.randint(len(self.windows), (size,), generator=generator)]
+
+
+class _PatrolSource:
+    """Windows of simulated episodes, each a function of its seed alone; more join as the training goes on."""
+
+    def __init__(self, config: "TrainConfig") -> None:
+        self.config, paper = config, config.paper
+        centre = paper.centre_m or (0.0, 0.0)
+        self.model = paper.model_config(centre, paper.scale_m or 0.5 * paper.patrol.side_m)
+        self.episodes: dict[int, AbsoluteWindows] = {}
+        offset = config.seed + _VALIDATION_SEED_OFFSET
+        self.validation = join_absolute([self._simulated(offset, i) for i in range(paper.num_validation_episodes)])
+        if len(self.validation) == 0:
+            raise ConfigError("train.paper.patrol: no window of the validation episodes has a detection; raise detection_rate")
+
+    def batch(self, step: int, size: int, generator: torch.Generator) -> AbsoluteWindows:
+        num = min(self.config.paper.num_episodes, _FIRST_EPISODES + step // _STEPS_AN_EPISODE)
+        pick = torch.randint(num, (size,), generator=generator)
+        counts = torch.bincount(pick, minlength=num).tolist()
+        parts = []
+        for index, count in enumerate(counts):
+            windows = self._episode(index) if count else self.validation[:0]
+            if len(windows):
+                parts.append(windows[torch.randint(len(windows), (count,), generator=generator)])
+        # episodes in which nothing was seen leave gaps; none at all is next to impossible
+        return join_absolute(parts or [self.validation[:size]])
+
+    def _episode(self, index: int) -> AbsoluteWindows:
+        if index not in self.episodes:
+            self.episodes[index] = self._simulated(self.config.seed, index)
+        return self.episodes[index]
+
+    def _simulated(self, seed: int, index: int) -> AbsoluteWindows:
+        episode = simulate_patrol(self.config.paper.patrol, np.random.default_rng([seed, index]))
+        mission = mission_of_episode(episode, f"patrol-{seed}-{index}")
+        return mission_windows(mission, self.config.paper, self.model, seed * 1_000_003 + index)
+
+
+@dataclass(frozen=True, eq=False)
+class KnownWindows:
+    """Windows with truth_m [B, A, T, 2] relative to their datum, is_known [B, A, T], elapsed [B]."""
+
+    windows: MissionWindows
+    truth_m: Tensor
+    is_known: Tensor
+    elapsed: Tensor
+
+
+def draw_windows(mission: TrainingMission, training: AbsoluteTraining, model: AbsoluteConfig, seed: int) -> KnownWindows:
+    """`num_windows` windows of a mission with at least one detection, at random whole steps after its first truth sample."""
+    step_ns = round(model.step_s * 1e9)
+    times = mission.truth["time_ns"].to_numpy()
+    rng = np.random.default_rng([seed, 2])
+    num_steps = max(1, int(times.max() - times.min()) // step_ns + 1)
+    origins = times.min() + step_ns * np.sort(rng.integers(0, num_steps, training.num_windows))
+    grid = Grid(step_ns, model.history_steps, model.horizon_steps, origins, training.context_steps)
+    windows = build_windows(mission.detections, grid, seed)
+    truth_m, is_known = truth_on_grid(mission.truth, windows, training.max_gap_steps * model.step_s)
+    if training.parked_tail:
+        truth_m, is_known = _parked(mission, windows, truth_m, is_known)
+    elapsed = torch.from_numpy((origins - times.min()) / step_ns / model.age_scale_steps)
+    return KnownWindows(windows, _filled(truth_m, is_known), is_known, elapsed)
+
+
+def mission_windows(mission: TrainingMission, training: AbsoluteTraining, model: AbsoluteConfig, seed: int) -> AbsoluteWindows:
+    """Training windows of a mission: those of its agents that were detected before the window's origin; maybe none."""
+    if mission.detections.num_rows == 0:
+        return _no_windows(model)
+    return _normalised(draw_windows(mission, training, model, seed), model)
+
+
+def _normalised(known: KnownWindows, model: AbsoluteConfig) -> AbsoluteWindows:
+    """Active agents as rows, in the network's units; rows without any known step are left out."""
+    windows, is_known = known.windows, known.is_known
+    nodes, _ = active_rows(windows.batch)
+    window, agent = windows.batch.is_active.nonzero(as_tuple=True)
+    centre = torch.tensor(model.centre_m, dtype=torch.float64) - torch.from_numpy(windows.datum_m)[window]
+    if model.relative:
+        centre = nodes.position_m[torch.arange(len(window)), nodes.is_observed.sum(dim=1) - 1]
+    age = -nodes.time_s / model.step_s / model.age_scale_steps
+    place = (nodes.position_m - centre[:, None]) / model.scale_m
+    rows, is_observed = detection_rows(age, place, nodes.is_observed, model.network.max_detections)
+    clean = ((known.truth_m[window, agent] - centre[:, None]) / model.scale_m).float()
+    extra = known.elapsed[window, None].float() if model.network.elapsed else None
+    found = AbsoluteWindows(clean, is_known[window, agent], rows, is_observed, extra)
+    return found[is_known[window, agent].any(dim=-1).nonzero()[:, 0]]
+
+
+def _no_windows(model: AbsoluteConfig) -> AbsoluteWindows:
+    t, n = model.network.num_steps, model.network.max_detections
+    none = torch.zeros(0, t, 2), torch.zeros(0, t, dtype=torch.bool), torch.zeros(0, n, 3), torch.zeros(0, n, dtype=torch.bool)
+    return AbsoluteWindows(*none, torch.zeros(0, 1) if model.network.elapsed else None)
+
+
+def _parked(mission: TrainingMission, windows: MissionWindows, truth_m: Tensor, is_known: Tensor) -> tuple[Tensor, Tensor]:
+    """Every agent stays at its last true position after the end of its truth."""
+    truth_m, is_known = truth_m.clone(), is_known.clone()
+    steps_ns = windows.origins_ns[:, None] + np.round(windows.batch.time_s.numpy() * 1e9).astype(np.int64)
+    agents = np.array(mission.truth["agent_id"].to_pylist(), dtype=object)
+    times = mission.truth["time_ns"].to_numpy()
+    places: Float64s = np.stack([mission.truth[name].to_numpy() for name in ("x_m", "y_m")], axis=-1)
+    for index, agent in enumerate(windows.agent_ids):
+        mine = np.flatnonzero(agents == agent)
+        if len(mine):
+            last = mine[np.argmax(times[mine])]
+            is_after = torch.from_numpy(steps_ns > times[last])
+            spot = torch.from_numpy(places[last] - windows.datum_m)[:, None]
+            truth_m[:, index] = torch.where(is_after[..., None], spot, truth_m[:, index])
+            is_known[:, index] |= is_after
+    return truth_m, is_known
+
+
+def _filled(truth_m: Tensor, is_known: Tensor) -> Tensor:
+    """Unknown steps take the value of the known one before, or else the first one after: they do not count, but are seen."""
+    steps = torch.arange(is_known.shape[-1]).expand(is_known.shape)
+    before = torch.where(is_known, steps, -1).cummax(dim=-1).values
+    first = torch.where(is_known, steps, is_known.shape[-1] - 1).amin(dim=-1, keepdim=True)
+    index = torch.where(before >= 0, before, first)
+    return truth_m.gather(-2, index[..., None].expand(truth_m.shape))
+
+
+def _map_limits(training: AbsoluteTraining, places_m: Sequence[npt.NDArray[Any]]) -> tuple[tuple[float, float], float]:
+    """Centre and half side of the square that holds all places [2, N], with a little room; what is configured is kept."""
+    low = np.min([place.min(axis=1) for place in places_m], axis=0).astype(np.float64)
+    high = np.max([place.max(axis=1) for place in places_m], axis=0).astype(np.float64)
+    middle = 0.5 * (low + high)
+    centre = training.centre_m or (float(middle[0]), float(middle[1]))
+    half = float(np.maximum(high - np.array(centre), np.array(centre) - low).max()) * _MARGIN
+    return centre, training.scale_m or (half if half > 0 else 1.0)
+
+
+def _joined(parts: list[AbsoluteWindows], data: Path) -> AbsoluteWindows:
+    windows = join_absolute(parts)
+    if len(windows) == 0:
+        raise InputError(f"{data}: no window of these logs has both a detection and truth; check that agents are named alike")
+    return windows

@@ -1,0 +1,163 @@
+"""Training of the scene preset: one place learned by heart, from the episodes of a world or of a folder of logs."""
+
+import dataclasses
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+import torch
+from torch import nn
+
+from cadence.diffusion.scene_frame import SceneConfig
+from cadence.network.attention import Team
+from cadence.network.scene import Pieces, SceneInputs, SceneNetwork
+from cadence.training.loop import Loss, Trainer
+from cadence.training.scene import Dropout, SceneWindows, diffusion_loss, energy_loss, scene_windows
+from pipeline.checkpoints import find_checkpoint, load_weights
+from pipeline.episodes.pool import EpisodePool, EpisodeSource, load_pool
+from pipeline.episodes.recordings import RecordingsConfig
+from pipeline.manifest import StageResult
+from pipeline.progress import Progress
+from pipeline.train.run import TrainingRun, run_training
+
+if TYPE_CHECKING:
+    from pipeline.train.stage import TrainConfig
+
+_VALIDATION_BATCH = 250
+
+
+def _worlds() -> tuple[EpisodeSource, ...]:
+    return tuple(EpisodeSource(1.0, RecordingsConfig(set=name, num_episodes=4000)) for name in ("low", "med", "high"))
+
+
+def _validation() -> tuple[EpisodeSource, ...]:
+    return tuple(EpisodeSource(1.0, RecordingsConfig(set=name, num_episodes=50, seed=1)) for name in ("low", "med", "high"))
+
+
+@dataclass(frozen=True)
+class SceneTraining:
+    """What the scene preset is trained on, and for what.
+
+    model           sizes, inputs and units; few_steps is set by the objective "energy"
+    objective       "diffusion" (noise levels at random), or "energy": a few-step sampler tuned by the energy score
+    start           checkpoint that the training starts from; "energy" needs one
+    sources         episodes to train on
+    validation      episodes to validate on
+    num_validation_windows  of each source
+    told            which windows are told of the start, the goal and the trackers
+    path_weight     of the positions' error beside that of the pieces, for "diffusion"
+    few_steps       evaluations of the sampler, for "energy"
+    num_samples     tracks a window, for "energy"
+    score_weights   of the whole track and of single pieces beside the positions, for "energy"
+    """
+
+    model: SceneConfig = field(default_factory=SceneConfig)
+    objective: Literal["diffusion", "energy"] = "diffusion"
+    start: str | None = None
+    sources: tuple[EpisodeSource, ...] = field(default_factory=_worlds)
+    validation: tuple[EpisodeSource, ...] = field(default_factory=_validation)
+    num_validation_windows: int = 1000
+    told: Dropout = field(default_factory=Dropout)
+    path_weight: float = 1.0
+    few_steps: int = 2
+    num_samples: int = 4
+    score_weights: tuple[float, float] = (0.3, 0.3)
+
+    def __post_init__(self) -> None:
+        if not self.sources or not self.validation:
+            raise ValueError("sources and validation must name episodes")
+        if self.few_steps < 1 or self.num_samples < 2 or self.num_validation_windows < 1:
+            raise ValueError("few_steps and num_validation_windows must be at least 1, num_samples at least 2")
+        if self.objective == "energy" and self.start is None:
+            raise ValueError("the objective 'energy' tunes a trained network: name its checkpoint in start")
+
+
+def train_scene(out: Path, config: "TrainConfig", progress: Progress, force: bool = False) -> StageResult:
+    """Train the scene preset into `out`; see `pipeline.train.stage.train`."""
+    scene, cache = config.scene, out / "episodes"
+    model = _model_config(scene)
+    together = model.network.attention_heads > 0
+    pool, held_out = (
+        load_pool(sources, cache, model.step_s, "train.scene.model", progress, together)
+        for sources in (scene.sources, scene.validation)
+    )
+    network = untrained_network(model, config.seed)
+    if scene.start is not None:
+        load_weights(find_checkpoint(scene.start), network)
+    return train_scene_network(out, config, network, pool, held_out, progress, force)
+
+
+def untrained_network(model: SceneConfig, seed: int) -> SceneNetwork:
+    """The network of a configuration with the first weights that belong to a seed."""
+    with torch.random.fork_rng(devices=[]):  # layers take their first weights from the global stream, which is left as it was
+        torch.random.manual_seed(seed)
+        return model.build()
+
+
+def train_scene_network(
+    out: Path,
+    config: "TrainConfig",
+    network: SceneNetwork,
+    pool: EpisodePool,
+    held_out: EpisodePool,
+    progress: Progress,
+    force: bool = False,
+) -> StageResult:
+    """Train a network that begins as it is given, on the windows of `pool`; those of `held_out` validate it."""
+    scene = config.scene
+    model = _model_config(scene)
+
+    def loss_at(step: int) -> Loss:
+        rng = np.random.default_rng([config.seed, step])
+        drawn = pool.rows(config.batch_size, rng)
+        windows = _joined([scene_windows(part, rows, model, scene.told, rng) for part, rows in drawn])
+        generator = torch.Generator().manual_seed(config.seed * 7_919 + step)
+        return lambda network: _loss(network, windows, scene, model, generator)
+
+    rng = np.random.default_rng([config.seed, 1, 2])
+    checks = held_out.rows_of_each(scene.num_validation_windows, rng)
+    validation = _joined([scene_windows(part, rows, model, scene.told, rng) for part, rows in checks])
+
+    @torch.no_grad()
+    def validate(network: nn.Module) -> float:
+        generator = torch.Generator().manual_seed(1)
+        parts = validation.parts(_VALIDATION_BATCH)
+        total = sum(float(_loss(network, part, scene, model, generator)) * len(part) for part in parts)
+        return total / len(validation)
+
+    start = None if scene.start is None else find_checkpoint(scene.start)
+    run = TrainingRun(out, "scene", config, model, config.optimiser.num_steps, start)
+    return run_training(run, Trainer(network, config.optimiser), loss_at, validate, progress, force)
+
+
+def _model_config(scene: SceneTraining) -> SceneConfig:
+    return dataclasses.replace(scene.model, few_steps=scene.few_steps if scene.objective == "energy" else 0)
+
+
+def _loss(
+    network: nn.Module, windows: SceneWindows, scene: SceneTraining, model: SceneConfig, generator: torch.Generator
+) -> torch.Tensor:
+    assert isinstance(network, SceneNetwork)
+    if scene.objective == "diffusion":
+        return diffusion_loss(network, windows, model, scene.path_weight, generator)
+    return energy_loss(network, windows, model, scene.num_samples, scene.score_weights, generator)
+
+
+def _joined(parts: list[SceneWindows]) -> SceneWindows:
+    """One set of several; trackers that only some have are absent in the others."""
+    num_trackers = max(part.inputs.trackers.shape[1] for part in parts)
+    columns: dict[str, list[torch.Tensor]] = {}
+    for part in parts:
+        pad = num_trackers - part.inputs.trackers.shape[1]
+        values = {name: value for name, value in vars(part.inputs).items() if name != "pieces"} | vars(part.inputs.pieces)
+        values["trackers"] = nn.functional.pad(values["trackers"], (0, 0, 0, pad))
+        values["is_tracker"] = nn.functional.pad(values["is_tracker"], (0, pad))
+        for name, value in values.items():
+            columns.setdefault(name, []).append(value)
+    joined = {name: torch.cat(values) for name, values in columns.items()}
+    pieces = Pieces(*(joined.pop(name) for name in ("last", "start", "duration", "span")))
+    teams = [part.team for part in parts if part.team is not None]
+    team = Team(torch.cat([team.is_present for team in teams])) if teams else None
+    clean, is_real = (torch.cat([getattr(part, name) for part in parts]) for name in ("clean", "is_real"))
+    return SceneWindows(SceneInputs(**joined, pieces=pieces), clean, is_real, team)
