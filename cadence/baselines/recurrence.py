@@ -4,12 +4,15 @@ Step by step through automatic differentiation most of the time goes into bookke
 all weights are one product over all steps, and the loop keeps only what follows from one step to the next.
 """
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
+
+from cadence.network.recurrent import run_in_float32
 
 _MIN_SIGMA = 1e-4
 """Least standard deviation of a latent variable."""
@@ -40,15 +43,15 @@ def run_recurrence(
     Returns:
         (m, q) [P, 2 z], feature [P, h], s' [P, h].
     """
-    apply: Callable[..., tuple[Tensor, Tensor, Tensor]] = _Recurrence.apply
-    return apply(of_features, gates_of_features, noise, sizes, *weights)
+    apply: Callable[..., tuple[Tensor, Tensor, Tensor]] = functools.partial(_Recurrence.apply, sizes)
+    return run_in_float32(apply, of_features, gates_of_features, noise, *weights)
 
 
 class _Recurrence(torch.autograd.Function):
     """See `run_recurrence`."""
 
     @staticmethod
-    def forward(ctx: Any, of_features: Tensor, of_gates: Tensor, noise: Tensor, sizes: list[int], *weights: Tensor) -> Any:
+    def forward(ctx: Any, sizes: list[int], of_features: Tensor, of_gates: Tensor, noise: Tensor, *weights: Tensor) -> Any:
         by_state, by_hidden, hidden_bias, by_out, out_bias, by_latent, latent_bias, by_feature = weights
         p, h = of_features.shape
         z = noise.shape[1]
@@ -121,7 +124,7 @@ class _Recurrence(torch.autograd.Function):
             to_feature.sum(0),
             feature.t() @ to_gates,
         )
-        return to_state[:, :h].clone(), to_gates, None, None, *of_weights
+        return None, to_state[:, :h].clone(), to_gates, None, *of_weights
 
 
 def previous_rows(sizes: list[int]) -> Tensor:

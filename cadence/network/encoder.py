@@ -3,6 +3,8 @@
 import torch
 from torch import Tensor, nn
 
+from cadence.network.recurrent import Lstm
+
 
 class DetectionEncoder(nn.Module):
     """Rows of detections [R, N, features] and their mask [R, N] to one vector a row [R, size].
@@ -13,13 +15,12 @@ class DetectionEncoder(nn.Module):
     def __init__(self, num_features: int, size: int) -> None:
         super().__init__()
         self.sentinel = nn.Parameter(torch.full((num_features,), -1.0))
-        self.lstm = nn.LSTM(num_features, size, batch_first=True)
+        self.lstm = Lstm(num_features, size)
 
     def forward(self, rows: Tensor, is_observed: Tensor) -> Tensor:
         """The hidden state after each row's last detection."""
         sentinel = self.sentinel.to(rows.dtype).expand(len(rows), 1, -1)
         padded = torch.cat([sentinel, rows * is_observed[..., None]], dim=1)
-        states, _ = self.lstm(padded)
+        states: Tensor = self.lstm(padded)
         last = is_observed.sum(dim=1)
-        result: Tensor = states[torch.arange(len(rows), device=rows.device), last]
-        return result
+        return states[torch.arange(len(rows), device=rows.device), last]

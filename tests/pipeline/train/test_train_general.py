@@ -28,7 +28,7 @@ from pipeline.train.stage import TrainConfig, train
 QUIET = Progress(quiet=True)
 NETWORK = ResidualNetworkConfig(width=8, multipliers=(1, 2), encoder_size=8, level_size=8)
 WINDOWS = SyntheticConfig(history_steps=16, horizon_steps=8, num_tracks=4, num_windows=2, num_samples=2)
-OPTIMISER = OptimiserConfig(num_steps=5, warm_up_steps=1)
+OPTIMISER = OptimiserConfig(num_steps=5, warm_up_steps=1, bf16=True)
 CONFIG = TrainConfig(
     batch_size=8, num_shards=2, validate_every=2, save_every=2, network=NETWORK, windows=WINDOWS, optimiser=OPTIMISER
 )

@@ -31,8 +31,8 @@ RIVAL = RivalTraining(
 )
 
 
-def config(preset, num_steps=6, rival=RIVAL, **changes):
-    optimiser = OptimiserConfig(num_steps=num_steps, warm_up_steps=1, learning_rate=0.01)
+def config(preset, num_steps=6, rival=RIVAL, bf16=False, **changes):
+    optimiser = OptimiserConfig(num_steps=num_steps, warm_up_steps=1, learning_rate=0.01, bf16=bf16)
     return TrainConfig(preset, batch_size=16, validate_every=2, save_every=2, optimiser=optimiser, rival=rival, **changes)
 
 
@@ -53,17 +53,17 @@ def recordings(seed=0, num_episodes=4, length=60):
 
 @pytest.mark.parametrize("preset", ["vrnn", "grammi_without_mi"])
 def test_a_killed_training_goes_on_and_ends_as_an_unbroken_one(preset, tmp_path):
-    parts = recordings(), recordings(1)
-    train_rival(tmp_path / "whole", config(preset), *parts, QUIET)
+    parts, rounded = (recordings(), recordings(1)), config(preset, bf16=True)
+    train_rival(tmp_path / "whole", rounded, *parts, QUIET)
     with pytest.raises(Killed):
-        train_rival(tmp_path / "broken", config(preset), *parts, Killer(5))
-    again = train_rival(tmp_path / "broken", config(preset), *parts, QUIET)
+        train_rival(tmp_path / "broken", rounded, *parts, Killer(5))
+    again = train_rival(tmp_path / "broken", rounded, *parts, QUIET)
     assert again.summary["steps"] == 6
     for name in ("checkpoint.safetensors", "curve.csv", "best.json"):
         assert (tmp_path / "broken" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes(), name
     found = [json.loads((tmp_path / folder / "checkpoint.json").read_text()) for folder in ("broken", "whole")]
     assert all(item["training"].pop("cpu_seconds") > 0 for item in found) and found[0] == found[1]
-    other = train_rival(tmp_path / "other", config(preset, seed=1), *parts, QUIET)
+    other = train_rival(tmp_path / "other", dataclasses.replace(rounded, seed=1), *parts, QUIET)
     assert other.summary["validation_loss"] != again.summary["validation_loss"]
 
 

@@ -62,7 +62,7 @@ def sources(tmp_path_factory):
 
 def config(sources, num_steps=4, **changes):
     scene = SceneTraining(MODEL, sources=sources, validation=sources[:1], num_validation_windows=20, **changes)
-    optimiser = OptimiserConfig(num_steps=num_steps, warm_up_steps=1)
+    optimiser = OptimiserConfig(num_steps=num_steps, warm_up_steps=1, bf16=True)
     return TrainConfig("scene", batch_size=12, validate_every=2, save_every=2, optimiser=optimiser, scene=scene)
 
 
