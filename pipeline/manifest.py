@@ -6,6 +6,7 @@ the hashes of its inputs and outputs, the versions and a summary — enough to r
 
 import contextlib
 import hashlib
+import itertools
 import json
 import os
 import secrets
@@ -13,7 +14,7 @@ import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 from cadence.errors import DeviceError, InputError
 from pipeline.config import config_as_dict
@@ -21,6 +22,9 @@ from pipeline.locks import clear_abandoned, locked
 from pipeline.provenance import versions
 
 JsonObject = Mapping[str, Any]
+
+CHAIN: Final[Mapping[str, str]] = {"ingest": "the catalogue", "extract": "the detections", "infer": "the hypotheses"}
+"""The stages whose results later ones read, in their order, and what their results are called."""
 
 
 @dataclass(frozen=True)
@@ -72,11 +76,14 @@ def run_stage(
     `body` gets an empty temporary folder inside `directory`, writes its output files there and returns the summary. Its
     files are then renamed into `directory`, the manifest last: a killed run leaves nothing that looks finished. Files that
     an earlier run of the stage left and this one did not write again are removed: nobody shall read a mixture.
+    Raises `InputError` where an input is stale (`check_chain`).
     """
+    digests = {path.name: hash_file(path) for path in inputs}
+    check_chain(stage, directory, digests)
     key = {
         "stage": stage,
         "config": config_as_dict(config),
-        "inputs": {path.name: hash_file(path) for path in inputs},
+        "inputs": digests,
         "versions": versions(),
     }
     clear_abandoned(directory, f".{stage}.")
@@ -97,6 +104,31 @@ def run_stage(
             os.replace(work / name, directory / name)
         write_atomic(manifest_path(stage, directory), json.dumps(manifest, indent=1, sort_keys=True) + "\n")
     return StageResult(stage, "done", tuple(directory / name for name in names), summary)
+
+
+def check_chain(stage: str, directory: Path, inputs: Mapping[str, str]) -> None:
+    """Raise `InputError` where what `stage` reads in `directory` does not belong together.
+
+    Each stage before it must have been made from what is there now, and `inputs` (SHA-256 by name) must be what they wrote.
+    Files that no manifest vouches for are taken as they are: somebody else made them.
+    """
+    made: dict[str, str] = {}
+    for earlier, results in itertools.takewhile(lambda item: item[0] != stage, CHAIN.items()):
+        manifest = read_manifest(earlier, directory)
+        again = f"run `cadence {earlier}` again, or `cadence run`, which does what is missing"
+        for name, digest in _digests(manifest, "inputs").items():
+            if made.get(name, digest) != digest:
+                raise InputError(f"{directory}: {results} were made from another {name} than the one that is there; {again}")
+        for name, digest in _digests(manifest, "outputs").items():
+            if inputs.get(name, digest) != digest:
+                raise InputError(f"{directory / name}: was changed after `cadence {earlier}` had written it; {again}")
+            made[name] = digest
+
+
+def _digests(manifest: JsonObject | None, kind: str) -> Mapping[str, str]:
+    """SHA-256 by name of the inputs or the outputs that a manifest vouches for."""
+    found = (manifest or {}).get(kind)
+    return found if isinstance(found, dict) else {}
 
 
 def write_atomic(path: Path, text: str) -> None:

@@ -30,7 +30,7 @@ from pipeline.extract.obstacle_sources import OBSTACLES_NAME, read_obstacles
 from pipeline.forecast.stage import ForecastConfig, evaluate_forecasts
 from pipeline.infer.stage import InferConfig
 from pipeline.infer.ways import Association, Sources, build_way_windows
-from pipeline.manifest import StageResult, read_manifest, run_stage, write_atomic
+from pipeline.manifest import StageResult, check_chain, read_manifest, run_stage, write_atomic
 from pipeline.missions import is_mission_directory
 from pipeline.progress import Progress
 from pipeline.results import MissionHypotheses, read_hypothesis_tables
@@ -130,6 +130,7 @@ def evaluate_folder(folder: Path, config: EvaluateConfig, progress: Progress) ->
     with progress.bar(len(directories), "evaluate", "log") as bar:
         for directory in directories:
             try:
+                check_chain("evaluate", directory, {})
                 scored.append(score_mission(directory, config, progress))
             except CadenceError as error:
                 failures.append(error)

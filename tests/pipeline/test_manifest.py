@@ -152,3 +152,57 @@ def test_manifest_is_the_same_bytes_each_time(tmp_path, source):
     run(tmp_path, source, Body(), force=True)
     assert manifest_path("demo", tmp_path / "mission").read_bytes() == first
     json.loads(first)
+
+
+def run_chain(mission: Path, log: Path, extract="A", until="export", config=Config()):
+    """Ingest, extract, infer and export as far as `until`, each reading what the one before wrote."""
+    catalogue, detections, hypotheses = (mission / name for name in ("catalogue.json", "d.parquet", "h.parquet"))
+    stages = {
+        "ingest": ([log], {"catalogue.json": log.read_text()}, Config()),
+        "extract": ([catalogue], {"d.parquet": extract}, config),
+        "infer": ([detections], {"h.parquet": "H"}, Config()),
+        "export": ([catalogue, detections, hypotheses], {"side.mcap": "S"}, Config()),
+    }
+    for stage, (inputs, files, config) in stages.items():
+        result = run_stage(stage, mission, config=config, inputs=inputs, body=Body(files))
+        if stage == until:
+            return result
+    raise AssertionError(until)
+
+
+def export_alone(mission: Path):
+    inputs = [mission / name for name in ("catalogue.json", "d.parquet", "h.parquet")]
+    return run_stage("export", mission, config=Config(), inputs=inputs, body=Body({"side.mcap": "S"}))
+
+
+def test_results_of_other_detections_are_refused(tmp_path, source):
+    mission = tmp_path / "mission"
+    run_chain(mission, source)
+    assert export_alone(mission).status == "skipped"
+    run_chain(mission, source, extract="B", until="extract", config=Config(2))
+    with pytest.raises(InputError, match=r"the hypotheses were made from another d\.parquet .*run `cadence infer` again"):
+        export_alone(mission)
+    assert run_chain(mission, source, extract="B", config=Config(2)).status == "done"
+
+
+def test_detections_of_another_catalogue_are_refused_by_all_later_stages(tmp_path, source):
+    mission = tmp_path / "mission"
+    run_chain(mission, source)
+    source.write_text("another log")
+    run_chain(mission, source, until="ingest")
+    says = r"the detections were made from another catalogue\.json .*run `cadence extract` again"
+    with pytest.raises(InputError, match=says):
+        run_stage("infer", mission, config=Config(), inputs=[mission / "d.parquet"], body=Body({"h.parquet": "H"}))
+    with pytest.raises(InputError, match=says):
+        export_alone(mission)
+
+
+def test_what_was_changed_by_hand_is_refused_and_what_nobody_vouches_for_is_not(tmp_path, source):
+    mission = tmp_path / "mission"
+    run_chain(mission, source)
+    (mission / "d.parquet").write_text("edited")
+    with pytest.raises(InputError, match=r"d\.parquet: was changed after `cadence extract` had written it"):
+        export_alone(mission)
+    for stage in ("extract", "infer"):
+        manifest_path(stage, mission).unlink()
+    assert export_alone(mission).status == "done"

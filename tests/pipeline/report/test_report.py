@@ -75,6 +75,12 @@ def make(directory: Path, config: ReportConfig | None = None) -> str:
     return (directory / "report.html").read_text(encoding="utf-8")
 
 
+def rewrite(mission: Path, name: str, content: str) -> None:
+    """Put another content into a file, for which no manifest vouches any more."""
+    (mission / name).write_text(content)
+    (mission / "ingest.manifest.json").unlink()
+
+
 def built(folder: Path, **options) -> Path:
     folder.mkdir()
     return build_mission(folder, **options)
@@ -137,7 +143,7 @@ def test_what_a_log_names_itself_stays_text(mission: Path) -> None:
         "lost_spans_ns": [[0, 10**9]],
         HOSTILE[1]: HOSTILE[0],
     }
-    (mission / "catalogue.json").write_text(json.dumps(catalogue))
+    rewrite(mission, "catalogue.json", json.dumps(catalogue))
     (mission / "obstacles.json").write_text(
         json.dumps({"obstacles": [{"kind": "circle", "x_m": 1, "y_m": 2, "radius_m": 3, "name": HOSTILE[0]}]})
     )
@@ -225,7 +231,7 @@ def test_one_hypothesis_of_one_step_is_enough_for_a_page(mission: Path) -> None:
 
 def test_stamps_on_another_clock_than_the_log(mission: Path) -> None:
     catalogue = json.loads((mission / "catalogue.json").read_text())
-    (mission / "catalogue.json").write_text(json.dumps(catalogue | {"start_ns": 5 * 10**9, "end_ns": 9 * 10**9}))
+    rewrite(mission, "catalogue.json", json.dumps(catalogue | {"start_ns": 5 * 10**9, "end_ns": 9 * 10**9}))
     assert "2023-11-14 22:13:2" in Page(make(mission)).text
 
 
@@ -286,7 +292,7 @@ def test_windows_without_any_hypotheses_are_skipped_on_the_map(mission: Path) ->
 def test_bad_input_is_one_line_and_leaves_no_page(mission: Path, name: str, content: str | None, words: str) -> None:
     (mission / name).unlink()
     if content is not None:
-        (mission / name).write_text(content)
+        rewrite(mission, name, content)
     before = sorted(path.name for path in mission.iterdir())
     with pytest.raises(InputError, match=words) as caught:
         report(mission, ReportConfig(), QUIET)
