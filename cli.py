@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 import typer
 
 from cadence.errors import CadenceError, UsageError
-from pipeline.batch.summaries import batch_summary, log_record, stage_summary, to_json
+from pipeline.batch.summaries import batch_summary, log_record, stage_exit_code, stage_summary, to_json
 from pipeline.config import stage_config
 from pipeline.manifest import StageResult
 from pipeline.missions import mission_directories
@@ -17,6 +17,7 @@ from pipeline.progress import Progress
 
 EXIT_INTERRUPTED = 130
 _COMBINED = ["export.combined=true"]
+_STRICT = ["extract.is_strict=true"]
 
 app = typer.Typer(
     name="cadence",
@@ -33,7 +34,7 @@ app = typer.Typer(
       cadence COMMAND --help                options and examples of one command
 
     Exit codes: 0 ok, 1 defect, 2 wrong call, 3 unusable input, 4 configuration, 5 device or storage, 6 quality gate,
-    7 damaged input, 130 interrupted.
+    7 damaged input, 8 suspected input, 130 interrupted.
     """,
 )
 
@@ -62,6 +63,7 @@ Set = Annotated[
     list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="One setting, as in infer.num_hypotheses=50; repeatable.")
 ]
 Combined = Annotated[bool, typer.Option("--combined", help="Also write one file that holds the log and the results.")]
+Strict = Annotated[bool, typer.Option("--strict", help="Refuse logs of which something is suspected: extract.is_strict.")]
 Force = Annotated[bool, typer.Option("--force", help="Do it again even where nothing has changed.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress on stderr; errors only.")]
 Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON on stdout.")]
@@ -103,7 +105,8 @@ def doctor(logs: Logs, quiet: Quiet = False, as_json: Json = False) -> int:
     """Say what is wrong with a log, and what to do.
 
     Damage and lost time spans, index and checksums, clocks and gaps, channels that cannot be decoded, what `cadence run`
-    would take. Exit code 0: every message can be read; 7: messages are lost, or may be; 3: no message can be read.
+    would take, what it would suspect. Exit code 0: every message can be read and nothing is suspected; 8: something is; 7:
+    messages are lost, or may be; 3: no message can be read.
 
     \b
     Examples:
@@ -120,14 +123,15 @@ def doctor(logs: Logs, quiet: Quiet = False, as_json: Json = False) -> int:
 @app.command()
 def run(
     logs: Logs, out: RunOut, workers: Workers = None, engine: Engine = "local", start: Start = None, end: End = None,
-    topic: Topic = None, combined: Combined = False, report: Report = None, config: Config = None, settings: Set = None,
-    seed: Seed = None, force: Force = False, quiet: Quiet = False, as_json: Json = False,
+    topic: Topic = None, combined: Combined = False, strict: Strict = False, report: Report = None, config: Config = None,
+    settings: Set = None, seed: Seed = None, force: Force = False, quiet: Quiet = False, as_json: Json = False,
 ) -> int:  # fmt: skip
     """Run all stages on every log.
 
     Ingest, extract, infer, export, report; finished stages are skipped. Folders are searched for logs, parts of a split
     recording are one mission. Each gets the mission directory DIR/<its name>; what became of all is in DIR/batch.json.
-    One bad log does not stop the others; the exit code is the highest of the failures, or 7 where only damaged logs are amiss.
+    One bad log does not stop the others; the exit code is the highest of the failures; without any it is 8 where results rest
+    on a suspicion, or 7 where only damaged logs are amiss.
     That nothing was detected in a log is no failure, unless nothing was detected in any of them (3).
 
     \b
@@ -142,7 +146,7 @@ def run(
     from pipeline.batch.run import selection_settings
     from pipeline.batch.tasks import RunConfig, complaints, exit_code
 
-    chosen = [*(settings or ()), *_COMBINED * combined, *selection_settings(start, end, topic or ())]
+    chosen = [*(settings or ()), *_COMBINED * combined, *_STRICT * strict, *selection_settings(start, end, topic or ())]
     resolved = stage_config(RunConfig, None, config, chosen, seed)
     outcomes = run_all(logs, out, resolved, Progress(quiet), force, engine, workers, report)
     typer.echo(to_json([log_record(outcome) for outcome in outcomes]) if as_json else batch_summary(outcomes))
@@ -173,9 +177,9 @@ def ingest(
 
 @app.command()
 def extract(
-    mission: Mission, config: Config = None, settings: Set = None, seed: Seed = None, force: Force = False,
-    quiet: Quiet = False, as_json: Json = False,
-) -> None:  # fmt: skip
+    mission: Mission, strict: Strict = False, config: Config = None, settings: Set = None, seed: Seed = None,
+    force: Force = False, quiet: Quiet = False, as_json: Json = False,
+) -> int:  # fmt: skip
     """Stage 2: get the detections out of the log.
 
     Detections, truth, sensor poses and obstacles, in one metric frame.
@@ -188,7 +192,10 @@ def extract(
     from pipeline.extract.stage import ExtractConfig
     from pipeline.extract.stage import extract as stage
 
-    _show(stage(mission, stage_config(ExtractConfig, "extract", config, settings or (), seed), Progress(quiet), force), as_json)
+    resolved = stage_config(ExtractConfig, "extract", config, [*(settings or ()), *_STRICT * strict], seed)
+    result = stage(mission, resolved, Progress(quiet), force)
+    _show(result, as_json)
+    return stage_exit_code(result)
 
 
 @app.command()

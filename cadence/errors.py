@@ -49,3 +49,9 @@ class PartialInputError(CadenceError):
     """A log is damaged: what is sound was read, some of it is lost."""
 
     exit_code = 7
+
+
+class ImplausibleInputError(CadenceError):
+    """What a log says cannot be meant as it stands: results rest on a suspicion, or are refused because of one."""
+
+    exit_code = 8

@@ -6,6 +6,8 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
+from cadence.errors import ImplausibleInputError, PartialInputError
+from pipeline.extract.plausibility import suspicions_in
 from pipeline.manifest import StageResult
 from pipeline.stores.urls import shown
 
@@ -18,7 +20,7 @@ SHOWN_STAGES = ("export", "report")
 MAX_LOGS_WITH_FILES = 3
 """With more logs than this the files of each are not listed."""
 
-Status = Literal["done", "skipped", "partial", "nothing detected", "failed"]
+Status = Literal["done", "skipped", "partial", "doubtful", "nothing detected", "failed"]
 """What became of a log; batch.json counts each."""
 
 BATCH_VERSION = 1
@@ -35,7 +37,15 @@ def stage_summary(result: StageResult) -> str:
     numbers = [_named(name, value) for name, value in result.summary.items() if type(value) in (int, float) and value]
     lines = [f"{result.stage}: {result.status}", *([f"  {', '.join(numbers)}"] if numbers else [])]
     lines += score_lines(result.summary.get("scores", ()))
+    lines += [f"  suspected {line}" for line in suspicions_in(result.summary)]
     return "\n".join(lines + [f"  {path}" for path in result.outputs])
+
+
+def stage_exit_code(result: StageResult) -> int:
+    """Of one stage that went through: 8 where its results rest on a suspicion, 7 where they do on a damaged log, else 0."""
+    if suspicions_in(result.summary):
+        return ImplausibleInputError.exit_code
+    return PartialInputError.exit_code if result.summary.get("is_complete") is False else 0
 
 
 def score_lines(scores: Sequence[Mapping[str, Any]]) -> list[str]:
@@ -75,7 +85,7 @@ def batch_record(outcomes: Sequence["LogOutcome"], exit_code: int, elapsed_s: fl
 
 
 def batch_summary(outcomes: Sequence["LogOutcome"]) -> str:
-    """A table with a row a log, what was lost of damaged ones, and the files to look at where they are few."""
+    """A table with a row a log, what was lost and what is suspected, and the files to look at where they are few."""
     numbers = ("num_windows", "num_agents", "num_detections")
     rows = [("log", "status", "windows", "agents", "detections", "time", "")]
     lines = []
@@ -88,6 +98,7 @@ def batch_summary(outcomes: Sequence["LogOutcome"]) -> str:
         rows.append((outcome.task.name, outcome.status, windows, agents, detections, elapsed, outcome.message))
         for stage in outcome.stages:
             lines += [f"{outcome.task.name}: damaged: {problem}" for problem in stage.summary.get("problems", ())]
+            lines += [f"{outcome.task.name}: suspected {line}" for line in suspicions_in(stage.summary)]
             if stage.stage in SHOWN_STAGES and len(outcomes) <= MAX_LOGS_WITH_FILES:
                 lines += [f"  {path}" for path in stage.outputs]
     return "\n".join([*_table(rows), *lines])

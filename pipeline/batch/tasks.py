@@ -12,9 +12,10 @@ from pathlib import Path
 
 import torch
 
-from cadence.errors import CadenceError, DeviceError, NothingDetectedError, PartialInputError
+from cadence.errors import CadenceError, DeviceError, ImplausibleInputError, NothingDetectedError, PartialInputError
 from pipeline.batch.summaries import Status
 from pipeline.export.stage import ExportConfig, export
+from pipeline.extract.plausibility import suspicions_in
 from pipeline.extract.stage import ExtractConfig, extract
 from pipeline.infer.stage import InferConfig, infer
 from pipeline.ingest.stage import IngestConfig, ingest
@@ -87,12 +88,23 @@ class LogOutcome:
 
     @property
     def status(self) -> Status:
-        """failed; nothing detected: no results; partial: they rest on a damaged log; skipped: all was done before; done."""
+        """What became of the log.
+
+        failed; nothing detected: no results; doubtful: they rest on a suspicion, whether or not the log is damaged as well;
+        partial: they rest on a damaged log; skipped: all was done before; done.
+        """
         if self.message:
             return "failed" if self.exit_code else "nothing detected"
+        if self.suspicions:
+            return "doubtful"
         if _is_damaged(self.stages):
             return "partial"
         return "skipped" if all(stage.status == "skipped" for stage in self.stages) else "done"
+
+    @property
+    def suspicions(self) -> tuple[str, ...]:
+        """What in the log cannot be meant as it stands, a sentence each."""
+        return tuple(line for stage in self.stages for line in suspicions_in(stage.summary))
 
 
 RunTask = Callable[[LogTask, Progress], LogOutcome]
@@ -152,9 +164,15 @@ def run_tasks(
 
 
 def exit_code(outcomes: Sequence[LogOutcome]) -> int:
-    """The highest code of the failures; without any, 7 where a log is damaged, 3 where nothing was detected in any; else 0."""
+    """The highest code of the failures; without any 8 where something is suspected, else 7 where a log is damaged.
+
+    3 where nothing was detected in any; else 0. Suspicion counts more than damage: a gap is seen as a gap, a wrong place is
+    believed.
+    """
     if any(outcome.exit_code for outcome in outcomes):
         return max(outcome.exit_code for outcome in outcomes)
+    if any(outcome.status == "doubtful" for outcome in outcomes):
+        return ImplausibleInputError.exit_code
     if any(outcome.status == "partial" for outcome in outcomes):
         return PartialInputError.exit_code
     return NothingDetectedError.exit_code if _is_nothing_detected(outcomes) else 0

@@ -14,6 +14,7 @@ Covariance = tuple[float, float, float, float, float, float]
 
 NONE_COVARIANCE: Final[Covariance] = (math.nan,) * 6
 
+_MAX_SIGMAS: Final = 4.0
 _PLACES: Final = {  # xx, xy, yy and xz, yz, zz among as many numbers; without heights: only the first three
     4: (0, 1, 3),
     6: (0, 1, 3, 2, 4, 5),
@@ -80,3 +81,17 @@ def rotated(covariance_m2: Float64s, rotation: Float64s) -> Float64s:
     full = covariance_m2[:, [0, 1, 3, 1, 2, 4, 3, 4, 5]].reshape(-1, 3, 3)
     turned = np.einsum("nij,njk,nlk->nil", rotation, full, rotation).reshape(-1, 9)
     return np.ascontiguousarray(turned[:, [0, 1, 4, 2, 5, 8]])
+
+
+def are_apart(offset_m: Float64s, covariance_m2: Float64s, other_m2: Float64s) -> npt.NDArray[np.bool_]:
+    """Which of N pairs of positions, `offset_m` [N, 2] from each other, are not views of one place.
+
+    Their covariances [N, 3] (xx, xy, yy; NaN: exact) allow for four standard deviations: more in one pair of 3000.
+    """
+    xx, xy, yy = (np.nan_to_num(covariance_m2) + np.nan_to_num(other_m2)).T
+    x, y = offset_m.T
+    determinant = xx * yy - xy * xy
+    with np.errstate(all="ignore"):
+        squared = (yy * x * x - 2 * xy * x * y + xx * y * y) / determinant
+    apart: npt.NDArray[np.bool_] = np.where(determinant > 0, squared > _MAX_SIGMAS**2, (x != 0) | (y != 0))
+    return apart

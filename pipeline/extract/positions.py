@@ -38,6 +38,7 @@ class Positions:
     first, second  x_m and y_m, or latitude_deg and longitude_deg where is_geodetic
     covariance_m2  [N, 3] xx, xy, yy
     height_covariance_m2  [N, 3] xz, yz, zz: what a tilted sensor frame turns into those
+    message        number of the message that holds the row, among those of its reader; unique in a role
     is_ned         whether x is north, y east and z down in the frame that the positions end in
     is_stated      whether the user configured the source (else it was suggested)
     """
@@ -45,6 +46,7 @@ class Positions:
     time_ns: npt.NDArray[np.int64]
     log_time_ns: npt.NDArray[np.int64]
     sequence: npt.NDArray[np.int64]
+    message: npt.NDArray[np.int64]
     first: Float64s
     second: Float64s
     z_m: Float64s
@@ -76,7 +78,7 @@ class Rows:
     """Growing columns of one reader (`Positions` once complete)."""
 
     def __init__(self) -> None:
-        self.integers = array("q")  # time, log time, sequence
+        self.integers = array("q")  # time, log time, sequence, message
         self.floats = array("d")  # first, second, z, score, covariance
         self.agents: list[str | None] = []
         self.sensors: list[str | None] = []
@@ -84,11 +86,11 @@ class Rows:
 
     def finish(self, topic: str = "", is_geodetic: bool = False, is_ned: bool = False, is_stated: bool = False) -> Positions:
         """The columns as arrays."""
-        integers = np.array(self.integers, dtype=np.int64).reshape(-1, 3)
+        integers = np.array(self.integers, dtype=np.int64).reshape(-1, 4)
         floats = np.array(self.floats, dtype=np.float64).reshape(-1, 10)
         num_rows = len(integers)
         return Positions(
-            integers[:, 0], integers[:, 1], integers[:, 2],
+            integers[:, 0], integers[:, 1], integers[:, 2], integers[:, 3],
             floats[:, 0], floats[:, 1], floats[:, 2], floats[:, 4:7], floats[:, 7:], floats[:, 3].astype(np.float32),
             np.array(self.agents, dtype=object), np.array(self.sensors, dtype=object),
             np.full(num_rows, topic, dtype=object), np.array(self.frame_ids, dtype=object),
@@ -188,7 +190,7 @@ class ChannelReader:
                 continue
             covariance = self._covariance(values["covariance"], values["covariance_type"])
             time_ns = default_ns if values["time"] is None else values["time"]
-            self.rows.integers.extend((time_ns, raw.log_time_ns, raw.sequence))
+            self.rows.integers.extend((time_ns, raw.log_time_ns, raw.sequence, self.counts["messages"]))
             self.rows.floats.extend((_number(first), _number(second), _number(z), _number(values["score"]), *covariance))
             self.rows.agents.append(self._identity("agent", values["agent"], place))
             self.rows.sensors.append(self._identity("sensor", values["sensor"], place))
@@ -206,6 +208,7 @@ class ChannelReader:
 
     def read_columns(self, columns: Mapping[str, npt.NDArray[Any]], batch: Batch) -> None:
         """Append what `field_columns` read of a batch: rows and counts are those of `read`, one message after the other."""
+        message = self.counts["messages"] + 1 + np.arange(len(batch))
         self.counts["messages"] += len(batch)
         for name, reader in zip((*_COLUMNS, *self.fields), (*self.positions[0], *self.fields.values()), strict=True):
             reader.is_found = reader.is_found or name in columns
@@ -223,7 +226,9 @@ class ChannelReader:
             time_ns = np.where(columns["time"] == 0, time_ns, columns["time"])
         absent = np.full(num_rows, math.nan)
         numbers = [columns.get(name, absent) for name in (*_COLUMNS, "score")]
-        self.rows.integers.frombytes(np.column_stack([time_ns, log_time_ns, sequence]).astype(np.int64).tobytes())
+        self.rows.integers.frombytes(
+            np.column_stack([time_ns, log_time_ns, sequence, message[has_fix]]).astype(np.int64).tobytes()
+        )
         self.rows.floats.frombytes(np.column_stack([*numbers, self._covariances(columns, num_rows)]).tobytes())
         for kind, names in (("agent", self.rows.agents), ("sensor", self.rows.sensors)):
             stated = columns[kind].tolist() if kind in columns else [None] * num_rows
@@ -288,6 +293,8 @@ class ChannelReader:
 
     def _identity(self, kind: str, value: Any, place: Place) -> str | None:
         """Constant, from a field, or None; truth and poses need a name, so theirs is at last the topic's (and the place)."""
+        if kind == "agent" and self.role == "detections" and self.source.has_identity is False:
+            return None
         constant = self.names[kind]
         name = _name(value) if constant is None else constant
         if name is not None or kind != {"truth": "agent", "poses": "sensor"}.get(self.role):

@@ -4,6 +4,7 @@ Decoded messages become rows in the mission frame, sorted by time; whatever is l
 """
 
 import contextlib
+import itertools
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -14,15 +15,18 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
-from cadence.errors import ConfigError, InputError, NothingDetectedError
+from cadence.errors import ConfigError, ImplausibleInputError, InputError, NothingDetectedError
 from pipeline.extract.collapse import Collapsed, collapse
+from pipeline.extract.identity import without_false_names
 from pipeline.extract.obstacle_sources import OBSTACLES_NAME, ObstacleSources, collect_obstacles, write_obstacles
 from pipeline.extract.placement import Placing, bring_together, in_enu, mission_frame, place
+from pipeline.extract.plausibility import Kind, Suspicions
 from pipeline.extract.positions import ChannelReader, Positions, Rows
 from pipeline.extract.reading import read_positions
 from pipeline.extract.selection import ROLES, select_readers, selected_channels
 from pipeline.extract.spikes import is_spike
 from pipeline.extract.stamps import moment_ns
+from pipeline.extract.summary import summarise, tell
 from pipeline.extract.thinning import ThinningConfig, is_seen, noise
 from pipeline.extract.transform_messages import LogTransforms
 from pipeline.extract.transforms import Limits
@@ -33,8 +37,6 @@ from pipeline.mapping.sources import SourceConfig
 from pipeline.progress import Progress
 from pipeline.tables import Frame, write_table
 from schemas.tables import DETECTIONS, POSES, TRUTH
-
-_STAMPS_APART_S = 3600.0
 
 
 @dataclass(frozen=True)
@@ -53,6 +55,8 @@ class ExtractConfig:
     max_transform_gap_s   longest time between two samples over which a transform is interpolated
     default_sigma_m  standard deviation of detections that state none; without it they count as exact
     max_speed_mps    single positions that could only be reached and left again faster are recorder faults (see `spikes`)
+    trusted          kinds of suspicion that are not looked for: what the log says of them counts as it stands (docs/formats.md)
+    is_strict        refuse a log of which something is suspected (`--strict`)
     datum            [latitude, longitude] in degrees of x = y = 0; by default the median of all positions, and unknown for
                      logs in metres
     obstacles        where obstacles come from; by default what the log says
@@ -74,6 +78,8 @@ class ExtractConfig:
     max_speed_mps: float | None = 1000.0
     datum: tuple[float, float] | None = None
     obstacles: ObstacleSources = field(default_factory=ObstacleSources)
+    trusted: tuple[Kind, ...] = ()
+    is_strict: bool = False
 
     def __post_init__(self) -> None:
         if not 0 <= self.simultaneity_s < np.inf:
@@ -95,7 +101,8 @@ class ExtractConfig:
 def extract(directory: Path, config: ExtractConfig, progress: Progress, force: bool = False) -> StageResult:
     """Write the tables of the log that `directory` was ingested from.
 
-    Raises `InputError` where no detection is left, of which `NothingDetectedError` where none was recorded.
+    Raises `InputError` where no detection is left, of which `NothingDetectedError` where none was recorded, and
+    `ImplausibleInputError` where something is suspected and `config.is_strict`.
     """
     catalogue = read_catalogue(directory)
 
@@ -111,13 +118,14 @@ def extract(directory: Path, config: ExtractConfig, progress: Progress, force: b
 
 def write_tables(log: MissionLog, folder: Path, config: ExtractConfig, progress: Progress) -> dict[str, Any]:
     """Write the files of the stage for `log` into `folder`; the summary."""
+    suspicions = Suspicions(config.trusted)
     stated = {"detections": config.detections, "truth": config.truth, "poses": config.poses}
     transforms = LogTransforms(log, progress)
     with _about(log):
         channels = selected_channels(log.channels, config.topics)
         readers = select_readers(stated, config.suggest, config.thinning, channels)
         counts = read_positions(log, readers, progress, *_cut_ns(log, config))
-        rows, frame = _rows_in_frame(readers, config, counts, transforms)
+        rows, frame = _rows_in_frame(readers, config, counts, suspicions, transforms)
     counts["unselected_topics"] = len({c.topic for c in log.channels} - {c.topic for c in channels})
     detections = collapse(_with_default_sigma(rows["detections"], config.default_sigma_m), config.simultaneity_s)
     counts["collapsed"] = len(rows["detections"]) - len(detections.positions)
@@ -131,13 +139,16 @@ def write_tables(log: MissionLog, folder: Path, config: ExtractConfig, progress:
         write_table(_track_table(log_id, poses, "sensor_id", poses.sensor, POSES), folder / "poses.parquet", "poses", frame)
     obstacles = collect_obstacles(log, config.obstacles, frame, progress.note)
     write_obstacles(folder / OBSTACLES_NAME, obstacles)
-    _tell(counts, detections.positions, log, progress)
+    tell(counts, suspicions, detections.positions, log, progress)
     transforms.tell()
     if frame.frame_id.lower().endswith("ned"):
         progress.note(
             f'extract: frame {frame.frame_id} may be north-east-down; if so give its sources frame_convention = "ned"'
         )
-    summary = _summary(log, readers, detections.positions, truth, poses, frame, counts, len(obstacles))
+    if config.is_strict and suspicions:
+        refused = "; ".join(suspicions.lines())
+        raise ImplausibleInputError(f"{log.path}: refused by --strict, as something in it is suspected: {refused}")
+    summary = summarise(log, readers, detections.positions, truth, poses, frame, counts, suspicions, len(obstacles))
     return summary | {"transforms": transforms.summary(counts)}
 
 
@@ -160,8 +171,9 @@ def _cut_ns(log: MissionLog, config: ExtractConfig) -> tuple[int | None, int | N
 
 
 def _rows_in_frame(
-    readers: Sequence[ChannelReader], config: ExtractConfig, counts: Counter[str], transforms: LogTransforms
-) -> tuple[dict[str, Positions], Frame]:
+    readers: Sequence[ChannelReader], config: ExtractConfig, counts: Counter[str], suspicions: Suspicions,
+    transforms: LogTransforms,
+) -> tuple[dict[str, Positions], Frame]:  # fmt: skip
     """The rows of every role, placed in the mission frame and thinned, and that frame."""
     rows = {role: _columns(role, readers, counts) for role in ROLES}
     primary = "truth" if config.thinning.enabled and config.thinning.thin_from == "truth" else "detections"
@@ -171,9 +183,10 @@ def _rows_in_frame(
     _check_any(primary, rows[primary], counts)
     rows = {role: in_enu(positions) for role, positions in rows.items()}
     frame = mission_frame(rows[primary], [rows[role] for role in ROLES if role != primary], config.datum)
-    for role in ROLES:
-        placed = _placed(role, rows[role], frame, counts, transforms.apart)
-        rows[role] = _without_spikes(placed, config.max_speed_mps, counts)
+    rows = {role: _placed(role, rows[role], frame, counts, transforms.apart) for role in ROLES}
+    believed = {reader.channel.topic for reader in readers if reader.source.has_identity}
+    rows["detections"] = without_false_names(rows["detections"], config.simultaneity_s, believed, suspicions)
+    rows = {role: _without_spikes(rows[role], config.max_speed_mps, counts) for role in ROLES}
     if config.thinning.enabled:
         rows["detections"] = _thinned(rows[primary], config.thinning)
         if len(rows["detections"]) == 0:
@@ -183,7 +196,7 @@ def _rows_in_frame(
 
 def _columns(role: str, readers: Sequence[ChannelReader], counts: Counter[str]) -> Positions:
     """All finite rows of a role, sorted by time."""
-    parts = [reader.finish() for reader in readers if reader.role == role]
+    parts = _numbered([reader.finish() for reader in readers if reader.role == role])
     counts["out_of_order"] += sum(int((part.time_ns < np.maximum.accumulate(part.time_ns)).sum()) for part in parts)
     rows = Positions.concatenate(parts or [Rows().finish()])
     is_finite = np.isfinite(rows.first) & np.isfinite(rows.second)
@@ -192,6 +205,15 @@ def _columns(role: str, readers: Sequence[ChannelReader], counts: Counter[str]) 
     counts["dropped_nonfinite"] += int((~is_finite).sum())
     rows = rows[is_finite]
     return rows[np.argsort(rows.time_ns, kind="stable")]
+
+
+def _numbered(parts: Sequence[Positions]) -> list[Positions]:
+    """The rows of each reader, with numbers of messages that no other reader has."""
+    sizes = [int(part.message.max(initial=0)) for part in parts]
+    return [
+        replace(part, message=part.message + before)
+        for part, before in zip(parts, itertools.accumulate(sizes, initial=0), strict=False)
+    ]
 
 
 def _check_any(role: str, rows: Positions, counts: Counter[str]) -> None:
@@ -301,55 +323,3 @@ def _track_table(log_id: str, rows: Positions, key: str, names: npt.NDArray[np.o
 def _table(columns: Mapping[str, Any], schema: pa.Schema) -> pa.Table:
     """NaN becomes null."""
     return pa.table([pa.array(columns[item.name], type=item.type, from_pandas=True) for item in schema], schema=schema)
-
-
-def _tell(counts: Counter[str], detections: Positions, log: MissionLog, progress: Progress) -> None:
-    """One line for each kind of thing that was left out."""
-    meanings = {
-        "dropped_nonfinite": "positions are NaN, infinite or off the earth and were skipped",
-        "incomplete": "messages have no position where the mapping looks for it and were skipped",
-        "undecodable": "messages cannot be decoded and were skipped",
-        "no_fix": "positions are marked as having no fix and were skipped",
-        "bad_covariance": "covariances are not positive definite and were replaced by the default",
-        "out_of_order": "time stamps were out of order and were sorted",
-        "spikes": "positions lie far off their track (see extract.max_speed_mps) and were skipped",
-        "other_frame": "positions are in another frame than the detections, which no transform joins, and were skipped",
-        "no_transform": "positions have no transform near enough in time (see extract.max_extrapolation_s) and were skipped",
-        "outside_time_cut": "messages lie outside extract.start and extract.end and were not used",
-        "unselected_topics": "topics fit none of extract.topics and were not used",
-    }
-    for name, meaning in meanings.items():
-        if counts[name]:
-            progress.note(f"extract: {counts[name]} {meaning}")
-    apart_s = float(np.median(np.abs(detections.time_ns - detections.log_time_ns))) * 1e-9
-    if apart_s > _STAMPS_APART_S:
-        advice = 'to use the log times give the source time = "log_time"'
-        progress.note(f"extract: stamps and log times are {apart_s:.0f} s apart; the stamps are used; {advice}")
-    for problem in log.health.problems:
-        progress.note(f"extract: {problem}")
-
-
-def _summary(
-    log: MissionLog, readers: Sequence[ChannelReader], detections: Positions, truth: Positions, poses: Positions, frame: Frame,
-    counts: Counter[str], num_obstacles: int,
-) -> dict[str, Any]:  # fmt: skip
-    agents = {agent for agent in detections.agent if agent is not None}
-    span_s = float(detections.time_ns[-1] - detections.time_ns[0]) * 1e-9
-    names = ("undecodable", "incomplete", "no_fix", "dropped_nonfinite", "bad_covariance", "out_of_order", "outside_time_cut")
-    return {
-        "num_detections": len(detections),
-        "num_truth": len(truth),
-        "num_poses": len(poses),
-        "num_obstacles": num_obstacles,
-        "num_agents": len(agents),
-        "num_unknown_origin": sum(agent is None for agent in detections.agent),
-        "span_s": span_s,
-        "frame": {"frame_id": frame.frame_id, "latitude_deg": frame.latitude_deg, "longitude_deg": frame.longitude_deg},
-        "sources": {role: sorted({r.source.topic for r in readers if r.role == role}) for role in ROLES},
-        **{
-            name: counts[name]
-            for name in (*names, "other_frame", "spikes", "collapsed", "duplicate_truth", "unselected_topics")
-        },
-        "lost_spans_ns": [list(span) for span in log.health.lost_spans_ns],
-        "is_complete": log.health.is_complete,
-    }

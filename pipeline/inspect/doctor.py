@@ -6,7 +6,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from cadence.errors import CadenceError, InputError, PartialInputError, UsageError
+from cadence.errors import CadenceError, ImplausibleInputError, InputError, PartialInputError, UsageError
+from pipeline.extract.plausibility import suspicions_in
 from pipeline.extract.stage import ExtractConfig, write_tables
 from pipeline.ingest.stage import survey_channels
 from pipeline.inspect.log_times import time_remarks
@@ -38,6 +39,7 @@ _ADVICE = {
     "as it is": "`cadence run` works on the damaged log as it is: it takes what is sound, and lost spans are gaps.",
     "recorder": "Let the recorder write checksums and an index (most do unless told otherwise), and end it in good order.",
     "clock": "Check the recorder's clock; a source with time = \"publish_time\" or a stamp's path uses another one.",
+    "suspicion": "Look at what is suspected, and state the setting that it names: then it is as you say.",
     "schema": "Channels that cannot be decoded are left out; to use one, record it with its schema in a known encoding.",
 }
 
@@ -54,6 +56,7 @@ class Diagnosis:
     container    what the file lacks without loss: index, statistics, checksums, order of its chunks
     clocks, gaps what is odd about the times; when nothing was recorded
     undecodable  channels that cannot be decoded, and why
+    suspicions   what a log says and can hardly mean, what was made of it, and how to decide otherwise
     use          what `cadence run` would take from the log without any settings
     no_use       why it would take nothing; empty where it would
     advice       what to do
@@ -71,6 +74,7 @@ class Diagnosis:
     clocks: tuple[str, ...] = ()
     gaps: tuple[str, ...] = ()
     undecodable: tuple[str, ...] = ()
+    suspicions: tuple[str, ...] = ()
     use: Mapping[str, Any] = field(default_factory=dict)
     no_use: str = ""
     advice: tuple[str, ...] = ()
@@ -101,23 +105,26 @@ def diagnose(parts: Sequence[Path], progress: Progress) -> Diagnosis:
 
 
 def exit_code(diagnoses: Sequence[Diagnosis]) -> int:
-    """0 where every message of every log can be read; of the others an unusable log counts more than a partial one."""
+    """0 where every message of every log can be read and meant; an unusable log counts most, then suspicion, then loss."""
     verdicts = {diagnosis.verdict for diagnosis in diagnoses}
     if "unusable" in verdicts:
         return InputError.exit_code
+    if any(diagnosis.suspicions for diagnosis in diagnoses):
+        return ImplausibleInputError.exit_code
     return PartialInputError.exit_code if "partial" in verdicts else 0
 
 
 def render(diagnosis: Diagnosis) -> str:
     """The diagnosis as text."""
-    lines = [f"{diagnosis.log}: {_MEANING[diagnosis.verdict]}"]
+    doubt = f"; DOUBTFUL: {len(diagnosis.suspicions)} things in it can hardly be meant" if diagnosis.suspicions else ""
+    lines = [f"{diagnosis.log}: {_MEANING[diagnosis.verdict]}{doubt}"]
     if diagnosis.num_messages:
         of = "" if diagnosis.num_messages_expected is None else f" of {diagnosis.num_messages_expected}"
         span = f"{utc(diagnosis.start_ns)} to {utc(diagnosis.end_ns)}"
         lines.append(f"  {diagnosis.num_messages}{of} messages can be read, {span}")
     titles = {
         "problems": "What is wrong", "container": "Container", "clocks": "Clocks", "gaps": "Gaps",
-        "undecodable": "Channels that cannot be decoded",
+        "undecodable": "Channels that cannot be decoded", "suspicions": "What is suspected",
     }  # fmt: skip
     for name, title in titles.items():
         if getattr(diagnosis, name):
@@ -141,6 +148,7 @@ def _of(name: str, log: MissionLog) -> Diagnosis:
         container.append("Some chunks have no checksum: changed bytes inside messages could not be noticed.")
     undecodable = tuple(channel.reason for channel in survey_channels(log) if channel.reason)
     use, no_use = _use_of(log)
+    suspicions = tuple(suspicions_in(use))
     verdict: Verdict = "partial" if not health.is_complete else "faulty" if health.problems else "sound"
     reasons = {
         "copy": not health.is_complete,
@@ -148,10 +156,11 @@ def _of(name: str, log: MissionLog) -> Diagnosis:
         "recorder": bool(container) or bool(health.problems and health.is_complete),
         "clock": bool(times.clocks),
         "schema": bool(undecodable),
+        "suspicion": bool(suspicions),
     }
     return Diagnosis(
         name, verdict, health.num_messages, health.num_messages_expected, log.start_ns, log.end_ns, health.lost_spans_ns,
-        health.problems, tuple(container), times.clocks, times.gaps, undecodable, use, no_use,
+        health.problems, tuple(container), times.clocks, times.gaps, undecodable, suspicions, use, no_use,
         tuple(_ADVICE[name] for name, applies in reasons.items() if applies),
     )  # fmt: skip
 

@@ -41,6 +41,8 @@ class SourceConfig:
     topic       exact, or with `{agent}` and/or `{sensor}` in place of a part of a name (`/truth/{agent}`)
     preset      a name of `pipeline.mapping.presets`; without one and without paths it is chosen by the schema
     agent, agent_path    who was seen: a constant, or a message path; neither (nor `{agent}`) means origin unknown
+    has_identity   whether messages and topics say who was seen; true: believed as it stands, false: never; default: judged by
+                   whether it can be meant
     sensor, sensor_path  who saw it
     x, y, z     message paths of a position in metres
     latitude, longitude, altitude   message paths of a position in degrees (and metres), instead of x, y and z
@@ -56,6 +58,7 @@ class SourceConfig:
     preset: str | None = None
     agent: str | None = None
     agent_path: str | None = None
+    has_identity: bool | None = None
     sensor: str | None = None
     sensor_path: str | None = None
     x: str | None = None

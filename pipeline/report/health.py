@@ -55,8 +55,8 @@ def _extraction(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
     rows = [(text(words), text(count)) for words, count in counted.items() if count]
     if counted and not rows:
         rows = [("left out", "nothing")]
-    # The log's own part of the page tells of these already.
-    known = {*LEFT_OUT, "lost_spans_ns", "is_complete", "frame"}
+    # Other parts of the page tell of these already.
+    known = {*LEFT_OUT, "lost_spans_ns", "is_complete", "frame", "suspicions"}
     return [(label(key), text(value)) for key, value in flatten(summary)[:MAX_ENTRIES] if key.split(".")[0] not in known] + rows
 
 

@@ -16,6 +16,7 @@ from pipeline.report.origins import origins_section
 from pipeline.report.payload import Payload
 from pipeline.report.provenance import provenance_section
 from pipeline.report.sections import moments_section, trouble_section, uncertainty_section
+from pipeline.report.suspicions import suspicions_section
 from pipeline.report.truth import truth_section
 from pipeline.tables import Frame
 
@@ -56,6 +57,7 @@ def write_page(mission: Mission, analysis: Analysis, payload: Payload, moments: 
     policy = f"default-src 'none'; style-src 'unsafe-inline'; script-src 'sha256-{digest}'; base-uri 'none'; form-action 'none'"
     sections = (
         _header(mission),
+        suspicions_section(mission),
         _reading(mission),
         _explorer(mission, payload),
         moments_section(mission, analysis, moments),

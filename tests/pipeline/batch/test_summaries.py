@@ -50,7 +50,7 @@ def test_a_batch_for_programs_counts_what_became_of_its_logs():
     record = batch_record([GOOD, BAD], 3, 2.0)
     assert {name: value for name, value in record.items() if name != "logs"} == {
         "version": 1, "exit_code": 3, "elapsed_s": 2.0, "num_logs": 2,
-        "num_done": 1, "num_skipped": 0, "num_partial": 0, "num_nothing_detected": 0, "num_failed": 1,
+        "num_done": 1, "num_skipped": 0, "num_partial": 0, "num_doubtful": 0, "num_nothing_detected": 0, "num_failed": 1,
     }  # fmt: skip
 
 

@@ -13,7 +13,7 @@ def positions(*rows: tuple[int, float, float, tuple[float, float, float], str | 
     """(milliseconds, x, y, covariance, agent, sensor) a row."""
     built = Rows()
     for place, (ms, x, y, covariance, agent, sensor) in enumerate(rows):
-        built.integers.extend((ms * 10**6, ms * 10**6, place))
+        built.integers.extend((ms * 10**6, ms * 10**6, place, place))
         built.floats.extend((x, y, 1.0, NAN, *covariance, NAN, NAN, NAN))
         built.agents.append(agent)
         built.sensors.append(sensor)

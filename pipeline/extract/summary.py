@@ -1,0 +1,72 @@
+"""What the stage says of its work: a line for each kind of thing that was left out, and the numbers of the manifest."""
+
+from collections import Counter
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from pipeline.extract.plausibility import Suspicions
+from pipeline.extract.positions import ChannelReader, Positions
+from pipeline.extract.selection import ROLES
+from pipeline.logs.reader import MissionLog
+from pipeline.progress import Progress
+from pipeline.tables import Frame
+
+_STAMPS_APART_S = 3600.0
+
+
+def tell(counts: Counter[str], suspicions: Suspicions, detections: Positions, log: MissionLog, progress: Progress) -> None:
+    """One line for each kind of thing that was left out, and for each suspicion."""
+    meanings = {
+        "dropped_nonfinite": "positions are NaN, infinite or off the earth and were skipped",
+        "incomplete": "messages have no position where the mapping looks for it and were skipped",
+        "undecodable": "messages cannot be decoded and were skipped",
+        "no_fix": "positions are marked as having no fix and were skipped",
+        "bad_covariance": "covariances are not positive definite and were replaced by the default",
+        "out_of_order": "time stamps were out of order and were sorted",
+        "spikes": "positions lie far off their track (see extract.max_speed_mps) and were skipped",
+        "other_frame": "positions are in another frame than the detections, which no transform joins, and were skipped",
+        "no_transform": "positions have no transform near enough in time (see extract.max_extrapolation_s) and were skipped",
+        "outside_time_cut": "messages lie outside extract.start and extract.end and were not used",
+        "unselected_topics": "topics fit none of extract.topics and were not used",
+    }
+    for name, meaning in meanings.items():
+        if counts[name]:
+            progress.note(f"extract: {counts[name]} {meaning}")
+    apart_s = float(np.median(np.abs(detections.time_ns - detections.log_time_ns))) * 1e-9
+    if apart_s > _STAMPS_APART_S:
+        advice = 'to use the log times give the source time = "log_time"'
+        progress.note(f"extract: stamps and log times are {apart_s:.0f} s apart; the stamps are used; {advice}")
+    for line in suspicions.lines():
+        progress.note(f"extract: suspected {line}")
+    for problem in log.health.problems:
+        progress.note(f"extract: {problem}")
+
+
+def summarise(
+    log: MissionLog, readers: Sequence[ChannelReader], detections: Positions, truth: Positions, poses: Positions, frame: Frame,
+    counts: Counter[str], suspicions: Suspicions, num_obstacles: int,
+) -> dict[str, Any]:  # fmt: skip
+    """The numbers of the stage."""
+    agents = {agent for agent in detections.agent if agent is not None}
+    span_s = float(detections.time_ns[-1] - detections.time_ns[0]) * 1e-9
+    names = ("undecodable", "incomplete", "no_fix", "dropped_nonfinite", "bad_covariance", "out_of_order", "outside_time_cut")
+    return {
+        "num_detections": len(detections),
+        "num_truth": len(truth),
+        "num_poses": len(poses),
+        "num_obstacles": num_obstacles,
+        "num_agents": len(agents),
+        "num_unknown_origin": sum(agent is None for agent in detections.agent),
+        "span_s": span_s,
+        "frame": {"frame_id": frame.frame_id, "latitude_deg": frame.latitude_deg, "longitude_deg": frame.longitude_deg},
+        "sources": {role: sorted({r.source.topic for r in readers if r.role == role}) for role in ROLES},
+        **{
+            name: counts[name]
+            for name in (*names, "other_frame", "spikes", "collapsed", "duplicate_truth", "unselected_topics")
+        },
+        "lost_spans_ns": [list(span) for span in log.health.lost_spans_ns],
+        "is_complete": log.health.is_complete,
+        "suspicions": suspicions.records(),
+    }
