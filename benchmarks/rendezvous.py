@@ -29,6 +29,7 @@ from cadence import metrics
 from cadence.association.associate import associate
 from cadence.association.types import AssociationConfig
 from cadence.diffusion.scene import SceneModel, SceneSampling
+from cadence.resampling import systematic
 from cadence.types import Detections, HypothesisSet, WindowBatch
 from cadence.worlds.joint import JointRecordings, meets
 from cadence.worlds.recordings import ForecastWindows, choose_windows, cut_windows
@@ -203,8 +204,7 @@ def ways_of(windows: ForecastWindows, episodes: JointRecordings) -> list[Ways]:
         for window, ways in zip(
             mine, associate(time_s, place, covariance, origins * recordings.step_s, config, episode), strict=True
         ):
-            at = (np.arange(NUM_WAYS) + 0.5) / NUM_WAYS
-            slot = np.minimum(np.searchsorted(np.cumsum(ways.weight), at), ways.num_ways - 1)
+            slot = systematic(ways.weight, NUM_WAYS, 0.5)
             known = ways.num_detections
             found[window] = Ways(window, ways.label[slot], step[:known], place[:known])
     return [found[window] for window in range(len(windows))]

@@ -8,6 +8,7 @@ from cadence.association.naming import named_like
 from cadence.association.particles import Particles, Stream, follow
 from cadence.association.presence import Habits
 from cadence.association.types import CLUTTER, AssociationConfig, Associations
+from cadence.resampling import systematic
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -70,9 +71,7 @@ def _readings(
 
 def _drawn(particles: Particles, num_ways: int, generator: np.random.Generator) -> tuple[Integers, Floats]:
     """At most so many different ways that stand for all, without bias."""
-    points = (np.arange(num_ways) + generator.random()) / num_ways
-    last_used = int(np.flatnonzero(particles.weight > 0)[-1])
-    particle = np.minimum(np.searchsorted(np.cumsum(particles.weight), points), last_used)
+    particle = systematic(particles.weight, num_ways, generator.random())
     label, count = np.unique(particles.ways(particle, generator), axis=0, return_counts=True)
     return label, count / num_ways
 

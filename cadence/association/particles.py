@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from cadence.association.history import Step, drawn_ways, grouped, recently, step_of
 from cadence.association.presence import Habits, log_hazards, log_silence_between
-from cadence.association.resampling import resample
 from cadence.association.tracks import Detection, Tracks, log_densities, updated
 from cadence.association.types import CLUTTER
+from cadence.resampling import resample
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]

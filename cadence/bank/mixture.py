@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from cadence.bank.smoother import Filtered, Nodes
+from cadence.resampling import systematic
 
 MAX_MODELS = 10
 """No more models than this take part in one window."""
@@ -109,10 +110,9 @@ def random_numbers(weight: Tensor, rows: Nodes, seeds: Tensor, num_hypotheses: i
     num_detections = rows.is_observed.sum(-1).tolist()
     for row, seed in enumerate(seeds.tolist()):
         generator = torch.Generator().manual_seed(seed)
-        start = torch.rand(1, generator=generator, dtype=torch.float64)
-        points = (torch.randperm(k, generator=generator) + start) / k
-        last_used = int((weight[row] > 0).sum()) - 1
-        owner[row] = torch.searchsorted(weight[row].cumsum(0).clamp(max=1.0), points).clamp(max=last_used)
+        start = torch.rand(1, generator=generator, dtype=torch.float64).item()
+        order = torch.randperm(k, generator=generator)
+        owner[row] = torch.from_numpy(systematic(weight[row].numpy(), k, start))[order]
         used = num_steps + num_detections[row]
         drawn = torch.randn(k, used, 4, generator=generator, dtype=torch.float64)
         normal[row, :, : used - 1] = drawn[:, :-1]

@@ -16,6 +16,7 @@ import torch
 from numpy.typing import NDArray
 
 from cadence.bank.rows import active_rows, scatter_hypotheses
+from cadence.resampling import candidates_at, systematic
 from cadence.types import Context, Detections, HypothesisSet, WindowBatch
 from cadence.worlds.recordings import Recordings
 
@@ -364,7 +365,6 @@ def _flattened(log_weight: Array, episode: Indices, min_episodes: float) -> Arra
 
 def _draw(weight: Array, number: int, rng: np.random.Generator, is_systematic: bool) -> Indices:
     """Indices [K] drawn with the weights [M], in random order."""
-    place = (np.arange(number) + rng.random()) / number if is_systematic else rng.random(number)
-    drawn = np.searchsorted(np.cumsum(weight), place * weight.sum(), side="right").clip(max=len(weight) - 1)
+    drawn = systematic(weight, number, rng.random()) if is_systematic else candidates_at(weight, rng.random(number))
     shuffled: Indices = rng.permutation(drawn)
     return shuffled

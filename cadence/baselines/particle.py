@@ -17,6 +17,7 @@ from scipy.optimize import minimize
 from scipy.special import ndtri
 
 from cadence.bank.rows import active_rows, scatter_hypotheses
+from cadence.resampling import systematic
 from cadence.types import Context, Detections, HypothesisSet, WindowBatch
 from cadence.worlds.recordings import Recordings
 
@@ -171,7 +172,7 @@ class ParticleFilter:
             place_m, noise_m2 = nodes.position_m[row, :count].numpy(), nodes.covariance_m2[row, :count].numpy()
             rng = np.random.default_rng(int(seeds[row]))
             particles = self._filtered(age[is_kept], place_m[is_kept], noise_m2[is_kept], rng)
-            chosen = particles[_systematic(np.full(self.num_particles, 1.0), num_hypotheses, rng)]
+            chosen = particles[systematic(np.ones(self.num_particles), num_hypotheses, rng.random())]
             sample_m[row] = self._forecast(chosen, int(age[-1]), windows.num_steps, rng)
         return scatter_hypotheses(torch.from_numpy(sample_m), windows)
 
@@ -200,7 +201,7 @@ class ParticleFilter:
         inverse = np.linalg.inv(kernel_m2 + noise_m2)
         offset = place_m - particles.place_m
         log_weight = -0.5 * np.einsum("pi,ij,pj->p", offset, inverse, offset)
-        chosen = _systematic(np.exp(log_weight - log_weight.max()), len(offset), rng)
+        chosen = systematic(np.exp(log_weight - log_weight.max()), len(offset), rng.random())
         gain = kernel_m2 @ inverse
         root = np.linalg.cholesky(gain @ noise_m2 + 1e-12 * np.eye(2))
         moved = particles.place_m[chosen] + offset[chosen] @ gain.T + rng.standard_normal(offset.shape) @ root.T
@@ -214,14 +215,6 @@ class ParticleFilter:
         end = rng.geometric(self.motion.end_rate, len(particles.heading)) if self.motion.end_rate > 0 else num_steps
         index = np.minimum(np.arange(num_steps)[:, None], end)
         return np.take_along_axis(place, index[..., None], axis=0).transpose(1, 0, 2)
-
-
-def _systematic(weight: Array, number: int, rng: np.random.Generator) -> NDArray[np.int64]:
-    """Indices of `number` particles drawn with the weights, evenly spaced on their cumulated sum."""
-    cumulated = np.cumsum(weight)
-    place = (np.arange(number) + rng.random()) / number * cumulated[-1]
-    drawn: NDArray[np.int64] = np.searchsorted(cumulated, place, side="right").clip(max=len(weight) - 1)
-    return drawn
 
 
 def _blocks(recordings: Recordings) -> tuple[NDArray[np.complex128], NDArray[np.int64]]:

@@ -10,6 +10,7 @@ from cadence.constraints.motion import SpeedConstraint
 from cadence.constraints.obstacles import ObstacleConstraint, Obstacles
 from cadence.constraints.repair import repair
 from cadence.diffusion.guidance import clean_estimate_guidance
+from cadence.resampling import systematic
 
 _PINNED_SHARE = 0.05
 _LEAST_WEIGHT = 1e-3
@@ -74,8 +75,7 @@ def resampled(position_m: Tensor, weight: Tensor, seeds: Tensor) -> Tensor:
     for row, seed in enumerate(seeds.tolist()):
         if float(weight[row].max() - weight[row].min()) > 1e-9:
             generator = torch.Generator().manual_seed(seed)
-            start = torch.rand(1, generator=generator, dtype=torch.float64)
-            points = (torch.arange(num_hypotheses, dtype=torch.float64) + start) / num_hypotheses
-            pick = torch.searchsorted(weight[row].cumsum(0).clamp(max=1.0), points).clamp(max=num_hypotheses - 1)
+            uniform = torch.rand(1, generator=generator, dtype=torch.float64).item()
+            pick = torch.from_numpy(systematic(weight[row].numpy(), num_hypotheses, uniform))
             out[row] = position_m[row, pick[torch.randperm(num_hypotheses, generator=generator)]]
     return out

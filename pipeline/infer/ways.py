@@ -21,6 +21,7 @@ from cadence.association.particles import Stream
 from cadence.association.presence import Habits
 from cadence.association.types import CLUTTER, AssociationConfig, Associations, agent_probability
 from cadence.errors import InputError
+from cadence.resampling import systematic
 from cadence.types import Detections, WindowBatch
 from pipeline.windows import (
     DetectionTrack,
@@ -361,10 +362,7 @@ class _Reader:
 
 def shared_out(weight: Float64s, num_hypotheses: int, seed: int) -> Int64s:
     """The way of each hypothesis [K] by systematic resampling of the weights [M]: way m gets within one of K w_m of them."""
-    start = np.random.default_rng(seed).random()
-    points = (np.arange(num_hypotheses) + start) / num_hypotheses
-    last_used = int(np.flatnonzero(weight > 0)[-1])
-    return np.minimum(np.searchsorted(np.cumsum(weight), points), last_used)
+    return systematic(weight, num_hypotheses, np.random.default_rng(seed).random())
 
 
 def _entropy_bits(probability: Float64s) -> Float64s:

@@ -11,7 +11,6 @@ from cadence.association.history import Step, drawn_ways, grouped, recently, ste
 from cadence.association.motion import Modes, motion
 from cadence.association.particles import Stream, continuations, follow
 from cadence.association.presence import Habits, left_by, log_hazards, log_silence, log_silence_between
-from cadence.association.resampling import resample, threshold
 from cadence.association.tracks import Detection, Tracks, log_densities, updated
 from cadence.association.types import CLUTTER
 from cadence.bank.components import ornstein_uhlenbeck, transition
@@ -229,19 +228,3 @@ def test_an_agents_rate_is_relearned_where_rates_change():
         about = dataclasses.replace(habits(), rate_weight=1.0)
         rate_hz = np.exp(log_silence(tracks, about, float(tracks.last_s[0, 0]))[1][0, 0])
         assert fewest < rate_hz < most
-
-
-@pytest.mark.parametrize("num", [1, 2, 5, 9])
-def test_resampling_keeps_the_heavy_and_is_right_on_average(num):
-    weight = np.array([0.3, 0.02, 0.2, 0.0, 0.1, 0.05, 0.15, 0.03, 0.1, 0.05])
-    level = threshold(weight[weight > 0], num) if num < 9 else 0.0
-    if num < 9:
-        np.testing.assert_allclose(np.minimum(weight / level, 1.0).sum(), num)
-    mean = np.zeros(len(weight))
-    for uniform in (np.arange(500) + 0.5) / 500:
-        index, new = resample(weight, num, uniform)
-        assert len(np.unique(index)) == len(index) <= num
-        np.testing.assert_allclose(new.sum(), 1.0)
-        np.testing.assert_allclose(new[weight[index] > level], weight[index][weight[index] > level], rtol=1e-9)
-        mean[index] += new / 500
-    np.testing.assert_allclose(mean, weight, atol=5e-3)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from cadence.baselines.particle import ParticleFilter, RandomTurn, _Particles, _systematic
+from cadence.baselines.particle import ParticleFilter, RandomTurn, _Particles
 from cadence.types import Estimator
 from cadence.worlds.recordings import ForecastWindows, Recordings, choose_windows, cut_windows
 
@@ -102,11 +102,6 @@ def test_what_comes_after_the_origin_does_not_matter() -> None:
     other.is_detected[61:] ^= True
     one, two = (ParticleFilter(STEADY).sample(cut_windows(r, np.array([0]), np.array([60])).windows, 4) for r in (rec, other))
     assert torch.equal(one.position_m, two.position_m)
-
-
-def test_resampling_keeps_the_weights() -> None:
-    weight = np.array([3.0, 0.0, 1.0])
-    assert np.bincount(_systematic(weight, 100, np.random.default_rng(0)), minlength=3).tolist() == [75, 0, 25]
 
 
 def test_misuse_is_refused() -> None:
