@@ -22,11 +22,12 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from association_logs import SHIPS, Estimate, Floats, Integers, Log, rendezvous_logs, ship_log
+from association_logs import SHIPS, Estimate, Log, rendezvous_logs, ship_log
 from association_scores import calibration, scores_of, told
 from association_trackers import KINDS, NUM_SAMPLES, Settings, searched, tracked
 from scipy.optimize import linear_sum_assignment
 
+from cadence.arrays import Float64s, Int64s
 from cadence.association.associate import associate
 from cadence.association.types import CLUTTER, AssociationConfig, agent_probability
 from cadence.bank.bank import Bank
@@ -43,7 +44,7 @@ HELD_OUT_SEED, TUNING_SEED = 20261, 20262
 Estimator = Callable[[Log], dict[str, Estimate]]
 
 
-def smoothed(log: Log, labels: Integers, num_samples: int) -> tuple[Floats, Floats]:
+def smoothed(log: Log, labels: Int64s, num_samples: int) -> tuple[Float64s, Float64s]:
     """The bank's mean tracks [M, A, T, 2] of M labellings [M, N], and samples [K, A, T, 2] of the first, to which it is fitted.
 
     Where the number of agents is not known a track ends at its first and last detection.
@@ -67,7 +68,7 @@ def smoothed(log: Log, labels: Integers, num_samples: int) -> tuple[Floats, Floa
     return mean.reshape(len(labels), num_agents, len(log.grid_s), 2), sample.swapaxes(0, 1)
 
 
-def _padded(log: Log, rows: list[Integers]) -> Detections:
+def _padded(log: Log, rows: list[Int64s]) -> Detections:
     """Some of the detections a row [R, 1, N]."""
     width = max((len(row) for row in rows), default=1) or 1
     index = np.stack([np.pad(row, (0, width - len(row))) for row in rows])[:, None]
@@ -95,7 +96,7 @@ def ours(log: Log) -> dict[str, Estimate]:
     }
 
 
-def set_mean(tracks: Floats, weight: Floats) -> Floats:
+def set_mean(tracks: Float64s, weight: Float64s) -> Float64s:
     """Mean [A, T, 2] of tracks [M, A, T, 2] as sets: at each moment those of every way are matched to the first one's.
 
     A mean by name would put agents half-way between two places wherever two ways exchange them; GOSPA knows no names.
@@ -253,7 +254,7 @@ def _row(name: str, rows: list[dict], common: list[np.ndarray]) -> str:
     return f"| {name} | " + " | ".join(cells) + " |"
 
 
-def _interval(gospas: Sequence[Floats]) -> Interval:
+def _interval(gospas: Sequence[Float64s]) -> Interval:
     """Mean GOSPA and its interval: over episodes, or over blocks of ten minutes where there is one log only."""
     values = np.concatenate(gospas)
     log = np.repeat(np.arange(len(gospas)), [len(gospa_m) for gospa_m in gospas])

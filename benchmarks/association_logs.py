@@ -5,15 +5,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cadence.arrays import Float64s, Int64s
 from cadence.worlds.rendezvous import RendezvousConfig, simulate_rendezvous_batch
 
 DATA = Path(__file__).resolve().parents[1].parent / "shared" / "data"
 SHIPS = DATA / "maritime/solent_ais_unknown.mcap"
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,12 +23,12 @@ class Log:
     are scored.
     """
 
-    time_s: Floats
-    position_m: Floats
+    time_s: Float64s
+    position_m: Float64s
     sigma_m: float
-    origin: Integers
-    grid_s: Floats
-    truth_m: Floats
+    origin: Int64s
+    grid_s: Float64s
+    truth_m: Float64s
     num_agents: int | None
     cutoff_m: float
     speed_mps: float
@@ -57,10 +54,10 @@ class Estimate:
     sample_m     [K, A', T, 2] equally likely tracks, each moment for itself
     """
 
-    position_m: Floats
-    label: Integers | None = None
-    probability: Floats | None = None
-    sample_m: Floats | None = None
+    position_m: Float64s
+    label: Int64s | None = None
+    probability: Float64s | None = None
+    sample_m: Float64s | None = None
 
 
 def rendezvous_logs(seed: int, number: int) -> list[Log]:

@@ -5,10 +5,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from association_logs import Estimate, Floats, Integers, Log
-from numpy.typing import NDArray
+from association_logs import Estimate, Log
 from scipy.optimize import linear_sum_assignment
 
+from cadence.arrays import Bools, Float64s, Int64s
 from cadence.association.types import CLUTTER
 from cadence.metrics import energy_score, gospa, ospa
 
@@ -24,10 +24,10 @@ class Scores:
     energy [A, T]     energy score of the track that lies nearest to each target; NaN where there is none within the cut-off
     """
 
-    distances: Floats
+    distances: Float64s
     right: float
     linked: float
-    energy: Floats
+    energy: Float64s
 
 
 def scores_of(estimate: Estimate, log: Log) -> Scores:
@@ -38,7 +38,7 @@ def scores_of(estimate: Estimate, log: Log) -> Scores:
     return Scores(gospas(estimate.position_m, log), right, linked, _energies(estimate, log))
 
 
-def gospas(position_m: Floats, log: Log) -> Floats:
+def gospas(position_m: Float64s, log: Log) -> Float64s:
     """GOSPA, its three parts and OSPA at the scored moments [T, 5]."""
     rows = []
     for index in np.flatnonzero(log.grid_s >= log.scored_from_s):
@@ -48,7 +48,7 @@ def gospas(position_m: Floats, log: Log) -> Floats:
     return np.array(rows)
 
 
-def _energies(estimate: Estimate, log: Log) -> Floats:
+def _energies(estimate: Estimate, log: Log) -> Float64s:
     """Energy score [A, T] of the tracks assigned to the targets at each moment, as GOSPA assigns them; NaN where none is."""
     scored = np.flatnonzero(log.grid_s >= log.scored_from_s)
     out = np.full((len(log.truth_m), len(scored)), np.nan)
@@ -67,7 +67,7 @@ def _energies(estimate: Estimate, log: Log) -> Floats:
     return out
 
 
-def label_scores(label: Integers, origin: Integers, is_scored: NDArray[np.bool_]) -> tuple[float, float]:
+def label_scores(label: Int64s, origin: Int64s, is_scored: Bools) -> tuple[float, float]:
     """Share of labels that are right (names matched once a log), and of an agent's successive detections with one label."""
     name = _matched(label, origin)
     linked = []
@@ -77,7 +77,7 @@ def label_scores(label: Integers, origin: Integers, is_scored: NDArray[np.bool_]
     return float((name == origin)[is_scored].mean()), float(np.concatenate(linked).mean())
 
 
-def _matched(label: Integers, origin: Integers) -> Integers:
+def _matched(label: Int64s, origin: Int64s) -> Int64s:
     """Labels renamed to the agents that they overlap most with, one to one; -1 for what matches nobody."""
     table = np.zeros((int(label.max(initial=0)) + 1, int(origin.max()) + 1))
     np.add.at(table, (label[label >= 0], origin[label >= 0]), 1)
@@ -87,7 +87,7 @@ def _matched(label: Integers, origin: Integers) -> Integers:
     return name[label]
 
 
-def told(probability: Floats, origin: Integers) -> tuple[Floats, NDArray[np.bool_]]:
+def told(probability: Float64s, origin: Int64s) -> tuple[Float64s, Bools]:
     """P(detection -> agent) of every detection and agent, flat, and whether it came true; names as they overlap most."""
     table = np.stack([probability[origin == agent, :-1].sum(0) for agent in range(int(origin.max()) + 1)], axis=1)
     pairs = list(zip(*linear_sum_assignment(-table), strict=True))
@@ -95,7 +95,7 @@ def told(probability: Floats, origin: Integers) -> tuple[Floats, NDArray[np.bool
     return said, np.concatenate([origin == column for _, column in pairs])
 
 
-def calibration(said: Floats, came: Floats) -> list[str]:
+def calibration(said: Float64s, came: Float64s) -> list[str]:
     """How often what is said comes true, in five bins."""
     lines = []
     for low, high in itertools.pairwise((0.0, 0.1, 0.5, 0.9, 0.99, 1.0 + 1e-9)):

@@ -11,8 +11,9 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from association_logs import Estimate, Floats, Log
+from association_logs import Estimate, Log
 
+from cadence.arrays import Float64s
 from cadence.association.types import CLUTTER
 from pipeline.manifest import write_atomic
 
@@ -109,7 +110,7 @@ def _likeliest_measurement(hypothesis: object) -> object:
 
 def _on_grid(
     track: Sequence, updates: list[int], grid_index: dict[datetime.datetime, int], is_held: bool
-) -> tuple[Floats, Floats]:
+) -> tuple[Float64s, Float64s]:
     """Smoothed positions [T, 2] and covariances from first to last detection; held beyond where all are always there."""
     mean, covariance = np.full((len(grid_index), 2), np.nan), np.broadcast_to(np.eye(2), (len(grid_index), 2, 2)).copy()
     last = updates[-1] if updates else 0
@@ -125,7 +126,7 @@ def _on_grid(
     return mean, covariance
 
 
-def _position(state) -> tuple[Floats, Floats]:
+def _position(state) -> tuple[Float64s, Float64s]:
     """Mean [2] and covariance [2, 2] of a state's position."""
     return np.ravel(state.state_vector)[[0, 2]].astype(float), np.asarray(state.covar, dtype=float)[np.ix_([0, 2], [0, 2])]
 

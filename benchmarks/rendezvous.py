@@ -22,10 +22,10 @@ import numpy as np
 import torch
 from matplotlib.axes import Axes
 from matplotlib.patches import Circle
-from numpy.typing import NDArray
 from torch import Tensor
 
 from cadence import metrics
+from cadence.arrays import Float64s, Int64s
 from cadence.association.associate import associate
 from cadence.association.types import AssociationConfig
 from cadence.diffusion.scene import SceneModel, SceneSampling
@@ -180,9 +180,9 @@ class Ways:
     """One window's ways: label [M, N] of the detections at `step` [N], `position_m` [N, 2] in the mission frame."""
 
     window: int
-    label: NDArray[np.int64]
-    step: NDArray[np.int64]
-    position_m: NDArray[np.float64]
+    label: Int64s
+    step: Int64s
+    position_m: Float64s
 
 
 def ways_of(windows: ForecastWindows, episodes: JointRecordings) -> list[Ways]:
@@ -259,7 +259,7 @@ class Scores:
     joint: Tensor
     joint_set: Tensor
     is_inside: Tensor
-    meets: NDArray[np.float64]
+    meets: Float64s
 
     @staticmethod
     def of(row: Row, drawn: HypothesisSet, windows: ForecastWindows) -> "Scores":
@@ -307,7 +307,7 @@ def render(scores: dict[str, Scores], windows: ForecastWindows, options: argpars
     groups = windows.episode.numpy()
     rng = np.random.default_rng(0)
 
-    def cell(values: Tensor | NDArray[np.float64], scale: float = 1e-3, digits: int = 2) -> str:
+    def cell(values: Tensor | Float64s, scale: float = 1e-3, digits: int = 2) -> str:
         found = metrics.bootstrap_mean(np.asarray(values), groups, rng)
         error = (found.high - found.low) / 3.92
         return f"{found.value * scale:.{digits}f} ± {error * scale:.{digits}f}"
@@ -370,9 +370,7 @@ def render(scores: dict[str, Scores], windows: ForecastWindows, options: argpars
     return "\n\n".join(parts) + "\n"
 
 
-def reliability(
-    share: NDArray[np.float64], truth: NDArray[np.float64], groups: NDArray[np.int64], rng: np.random.Generator
-) -> str:
+def reliability(share: Float64s, truth: Float64s, groups: Int64s, rng: np.random.Generator) -> str:
     """How often agents met, by how often the hypotheses did."""
     rows = ["| share of hypotheses that meet | windows | mean share | truth |", "|---|---|---|---|"]
     for low, high in ((0.0, 0.1), (0.1, 0.4), (0.4, 0.7), (0.7, 0.9), (0.9, 1.01)):

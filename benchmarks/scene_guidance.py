@@ -155,7 +155,7 @@ def _worst(model: SceneModel, task: Task) -> ForecastWindows:
     return found
 
 
-def _panel(axes: Axes, block: ForecastWindows, drawn: np.typing.NDArray[np.float64], title: str) -> None:
+def _panel(axes: Axes, block: ForecastWindows, drawn: np.typing.Float64s, title: str) -> None:
     cell, datum = prison_map.CELL_M, block.context.datum_m[0].numpy()
     axes.add_patch(Circle(prison_map.MOUNTAIN, prison_map.KEEP_OUT, color=_ROCK, alpha=0.6, lw=0))
     for track in (drawn + datum) / cell:

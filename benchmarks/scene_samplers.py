@@ -122,7 +122,7 @@ def cut_blocks(sets: dict[str, Recordings], num_windows: int, size: int, seed: i
 
 
 def block_of(
-    recordings: Recordings, number: int, episode: np.typing.NDArray[np.int64], step: np.typing.NDArray[np.int64], seed: int
+    recordings: Recordings, number: int, episode: np.typing.Int64s, step: np.typing.Int64s, seed: int
 ) -> ForecastWindows:
     """Windows of one set, whose episodes are numbered apart from those of other sets."""
     cut = cut_windows(recordings, episode, step, seed=seed)

@@ -1,12 +1,11 @@
 """Draws by weight: evenly spread ones, and few weighted candidates out of many, without bias."""
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from cadence.arrays import Float64s, Int64s
 
 
-def candidates_at(weight: Floats, share: Floats) -> NDArray[np.int64]:
+def candidates_at(weight: Float64s, share: Float64s) -> Int64s:
     """The candidate [K] into which each share in [0, 1) of the cumulated weights [M] falls; never one without weight."""
     edges = np.cumsum(weight)
     last_used = int(np.flatnonzero(weight > 0)[-1])
@@ -14,7 +13,7 @@ def candidates_at(weight: Floats, share: Floats) -> NDArray[np.int64]:
     return np.asarray(np.minimum(found, last_used), dtype=np.int64)
 
 
-def systematic(weight: Floats, num: int, uniform: float) -> NDArray[np.int64]:
+def systematic(weight: Float64s, num: int, uniform: float) -> Int64s:
     """Indices [num], ascending, evenly spaced along the cumulated weights [M].
 
     A candidate is drawn within one of its share of `num` times (systematic resampling: Kitagawa, "Monte Carlo filter and
@@ -28,7 +27,7 @@ def systematic(weight: Floats, num: int, uniform: float) -> NDArray[np.int64]:
     return candidates_at(weight, (np.arange(num) + uniform) / num)
 
 
-def resample(weight: Floats, num: int, uniform: float) -> tuple[NDArray[np.int64], Floats]:
+def resample(weight: Float64s, num: int, uniform: float) -> tuple[Int64s, Float64s]:
     """At most `num` of the candidates, no one twice, each weight right in expectation.
 
     Optimal resampling for discrete states (Fearnhead and Clifford, "On-line inference for hidden Markov models via particle
@@ -56,7 +55,7 @@ def resample(weight: Floats, num: int, uniform: float) -> tuple[NDArray[np.int64
     return index[order], new[order] / new.sum()
 
 
-def threshold(weight: Floats, num: int) -> float:
+def threshold(weight: Float64s, num: int) -> float:
     """The weight c with sum(min(weight / c, 1)) = num: heavier candidates are kept, lighter ones drawn with chance w / c."""
     ordered = np.sort(weight)
     num_light = np.arange(len(weight) - num + 1, len(weight) + 1)

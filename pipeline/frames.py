@@ -12,13 +12,11 @@ the meridians, about (longitude difference) · sin(latitude): 0.5° at 50 km and
 import functools
 
 import numpy as np
-import numpy.typing as npt
 from pyproj import Transformer
 
 from cadence.errors import InputError
+from pipeline.arrays import Float64s
 from pipeline.tables import Frame
-
-FloatArray = npt.NDArray[np.float64]
 
 GEOREFERENCED_FRAME_ID = "mission"
 DEFAULT_FRAME_ID = "map"
@@ -26,7 +24,7 @@ DATUM_DECIMALS = 4
 """The datum is rounded to 1e-4 degrees (11 m): easy to state, and equal for small changes of the input."""
 
 
-def georeferenced_frame(latitude_deg: FloatArray, longitude_deg: FloatArray, datum: tuple[float, float] | None = None) -> Frame:
+def georeferenced_frame(latitude_deg: Float64s, longitude_deg: Float64s, datum: tuple[float, float] | None = None) -> Frame:
     """The mission frame about `datum` (latitude, longitude; degrees), or about the median of the positions [N].
 
     Raises `InputError` without either.
@@ -42,13 +40,13 @@ def georeferenced_frame(latitude_deg: FloatArray, longitude_deg: FloatArray, dat
     return Frame(GEOREFERENCED_FRAME_ID, latitude, round(longitude, DATUM_DECIMALS))
 
 
-def to_local(frame: Frame, latitude_deg: FloatArray, longitude_deg: FloatArray) -> tuple[FloatArray, FloatArray]:
+def to_local(frame: Frame, latitude_deg: Float64s, longitude_deg: Float64s) -> tuple[Float64s, Float64s]:
     """x_m (east) and y_m (north) in `frame` of positions [N] in degrees."""
     x_m, y_m = _transformer(frame).transform(longitude_deg, latitude_deg)
     return np.asarray(x_m, dtype=np.float64), np.asarray(y_m, dtype=np.float64)
 
 
-def to_geodetic(frame: Frame, x_m: FloatArray, y_m: FloatArray) -> tuple[FloatArray, FloatArray]:
+def to_geodetic(frame: Frame, x_m: Float64s, y_m: Float64s) -> tuple[Float64s, Float64s]:
     """latitude_deg and longitude_deg of positions [N] in `frame`."""
     longitude, latitude = _transformer(frame).transform(x_m, y_m, direction="INVERSE")
     return np.asarray(latitude, dtype=np.float64), np.asarray(longitude, dtype=np.float64)

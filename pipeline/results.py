@@ -6,15 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 
 from cadence.errors import InputError
+from pipeline.arrays import Float32s, Float64s, Int32s, Int64s
 from pipeline.tables import Frame, read_table
-
-Float32s = npt.NDArray[np.float32]
-Float64s = npt.NDArray[np.float64]
-Int32s = npt.NDArray[np.int32]
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +96,7 @@ class _Rows:
     """The columns of HYPOTHESES sorted by window, agent and hypothesis, and where each (window, agent) begins and ends."""
 
     origin: Int32s
-    step_ns: npt.NDArray[np.int64]
+    step_ns: Int64s
     hypothesis: Int32s
     weight: Float32s
     datum_m: Float64s

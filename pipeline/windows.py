@@ -10,7 +10,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.compute as pc
 import torch
@@ -18,6 +17,7 @@ from torch import Tensor
 
 from cadence.errors import ConfigError, InputError
 from cadence.types import Detections, WindowBatch
+from pipeline.arrays import Bools, Float64s, Int64s
 
 UNKNOWN_AGENT = "unknown"
 """Name of the one agent that detections of unknown origin are taken to belong to where they are not told apart
@@ -25,9 +25,6 @@ UNKNOWN_AGENT = "unknown"
 
 _NICE = np.array([1.0, 1.2, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0])
 _STEPS_PER_GAP = 16.0
-
-Int64s = npt.NDArray[np.int64]
-Float64s = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -111,7 +108,7 @@ class DetectionTrack:
     position_m: Float64s
     covariance_m2: Float64s
 
-    def __getitem__(self, rows: slice | Int64s | npt.NDArray[np.bool_]) -> "DetectionTrack":
+    def __getitem__(self, rows: slice | Int64s | Bools) -> "DetectionTrack":
         """A selection of the detections."""
         return DetectionTrack(self.time_ns[rows], self.position_m[rows], self.covariance_m2[rows])
 
@@ -257,7 +254,7 @@ def truth_on_grid(truth: pa.Table, windows: MissionWindows, max_gap_s: float) ->
     return torch.from_numpy(np.nan_to_num(position)), torch.from_numpy(is_known_everywhere)
 
 
-def interpolated(track: DetectionTrack, time_ns: Int64s, max_gap_s: float) -> tuple[Float64s, npt.NDArray[np.bool_]]:
+def interpolated(track: DetectionTrack, time_ns: Int64s, max_gap_s: float) -> tuple[Float64s, Bools]:
     """Positions [..., 2] of a track at any times [...], and where they are known: between samples at most so far apart."""
     at = np.clip(np.searchsorted(track.time_ns, time_ns), 1, max(len(track.time_ns) - 1, 1))
     later = np.minimum(at, len(track.time_ns) - 1)
@@ -295,7 +292,7 @@ def _one_per_cell(track: DetectionTrack, grid: Grid) -> DetectionTrack:
     return track[is_first_or_last(track.time_ns, grid)]
 
 
-def is_first_or_last(time_ns: Int64s, grid: Grid) -> npt.NDArray[np.bool_]:
+def is_first_or_last(time_ns: Int64s, grid: Grid) -> Bools:
     """Which of one agent's detections [N], by time, are the first or the last of their step's cell."""
     is_next = np.diff((time_ns - grid.origins_ns[0]) // grid.step_ns) > 0
     return np.asarray(np.append(True, is_next) | np.append(is_next, True))

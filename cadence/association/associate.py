@@ -1,8 +1,8 @@
 """From a stream of detections to weighted ways to read it, at every window origin."""
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cadence.arrays import Float64s, Int64s
 from cadence.association.fitting import fit_habits
 from cadence.association.naming import named_like
 from cadence.association.particles import Particles, Stream, follow
@@ -10,15 +10,12 @@ from cadence.association.presence import Habits
 from cadence.association.types import CLUTTER, AssociationConfig, Associations
 from cadence.resampling import systematic
 
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-
 
 def associate(
-    time_s: Floats,
-    position_m: Floats,
-    covariance_m2: Floats,
-    origins_s: Floats,
+    time_s: Float64s,
+    position_m: Float64s,
+    covariance_m2: Float64s,
+    origins_s: Float64s,
     config: AssociationConfig,
     seed: int,
     max_speed_mps: float | None = None,
@@ -56,9 +53,9 @@ def associate(
 
 def _readings(
     stream: Stream, habits: Habits, config: AssociationConfig, seed: int, wanted: set[int]
-) -> dict[int, tuple[Integers, Floats]]:
+) -> dict[int, tuple[Int64s, Float64s]]:
     """Named labels and weights after each wanted number of detections."""
-    out: dict[int, tuple[Integers, Floats]] = {}
+    out: dict[int, tuple[Int64s, Float64s]] = {}
     reference = np.zeros(0, dtype=np.int64)
     for number, particles in enumerate(follow(stream, habits, config.num_particles, seed)):
         if number in wanted:
@@ -69,14 +66,14 @@ def _readings(
     return out
 
 
-def _drawn(particles: Particles, num_ways: int, generator: np.random.Generator) -> tuple[Integers, Floats]:
+def _drawn(particles: Particles, num_ways: int, generator: np.random.Generator) -> tuple[Int64s, Float64s]:
     """At most so many different ways that stand for all, without bias."""
     particle = systematic(particles.weight, num_ways, generator.random())
     label, count = np.unique(particles.ways(particle, generator), axis=0, return_counts=True)
     return label, count / num_ways
 
 
-def _named(label: Integers, weight: Floats, reference: Integers) -> tuple[Integers, Floats]:
+def _named(label: Int64s, weight: Float64s, reference: Int64s) -> tuple[Int64s, Float64s]:
     """The same ways with common names for their agents; first the one that agrees most with all on who was whose next."""
     before = _predecessors(label)
     best = int(np.argmax([weight @ (before == way).sum(axis=1) for way in before]))
@@ -85,7 +82,7 @@ def _named(label: Integers, weight: Floats, reference: Integers) -> tuple[Intege
     return np.stack([first, *(named_like(way, first) for way in label[order[1:]])]), weight[order]
 
 
-def _predecessors(label: Integers) -> Integers:
+def _predecessors(label: Int64s) -> Int64s:
     """The detection of the same agent before each one [M, N]: -1 for none, -2 for clutter.
 
     Ways that differ early by an exchange of two agents agree on most of these later on, which names alone would not tell.

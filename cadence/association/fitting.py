@@ -9,15 +9,13 @@ import itertools
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cadence.arrays import Float64s
 from cadence.association.motion import Modes
 from cadence.association.particles import Particles, Stream, follow
 from cadence.association.presence import Habits, left_by
 from cadence.association.tracks import Tracks
 from cadence.association.types import AssociationConfig
-
-Floats = NDArray[np.float64]
 
 _RELAXATIONS = (0.3, 2.0, 12.0, 72.0)
 _SPEEDS = tuple(3.0 ** -np.arange(8.0))
@@ -82,7 +80,7 @@ def _first_habits(stream: Stream, config: AssociationConfig, num_agents: int, ma
     )
 
 
-def _run(stream: Stream, habits: Habits, seed: int) -> tuple[Particles, Floats]:
+def _run(stream: Stream, habits: Habits, seed: int) -> tuple[Particles, Float64s]:
     """The particles after the whole stream, and how much each mode was used [C]."""
     usage = np.zeros(len(habits.modes))
     switch, share = habits.modes.switch_share, habits.modes.share
@@ -95,7 +93,7 @@ def _run(stream: Stream, habits: Habits, seed: int) -> tuple[Particles, Floats]:
     return particles, usage
 
 
-def _improved(habits: Habits, particles: Particles, usage: Floats, stream: Stream) -> Habits:
+def _improved(habits: Habits, particles: Particles, usage: Float64s, stream: Stream) -> Habits:
     """Habits after one round: modes as often as they were used, rates as a way of the likeliest particle counts them."""
     share = usage + _PSEUDO_COUNT / len(usage)
     share = share / share.sum()
@@ -126,7 +124,7 @@ def _with_rates(habits: Habits, tracks: Tracks, rate_hz: float, watched_s: float
     return dataclasses.replace(habits, rate_hz=rate_hz, leave_hz=leave_hz, num_present=num / (1.0 + leave_hz * span_s))
 
 
-def _log_density(gaps_s: list[Floats], rate_hz: float, weight: float, memory: float) -> float:
+def _log_density(gaps_s: list[Float64s], rate_hz: float, weight: float, memory: float) -> float:
     """Log density of agents' gaps between detections, where each has a rate of its own (see `presence`)."""
     total = 0.0
     for gaps in gaps_s:

@@ -10,12 +10,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cadence.arrays import Float64s, Int64s
 from cadence.association.types import CLUTTER
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 _LEAST_SHARE = 1e-4
 """Pasts that make up less of a particle are left out."""
@@ -33,15 +30,15 @@ class Step:
     names    [U, A] the child's number of each agent of the parent
     """
 
-    child: Integers
-    parent: Integers
-    share: Floats
-    agent: Integers
-    renaming: Integers
-    names: Integers
+    child: Int64s
+    parent: Int64s
+    share: Float64s
+    agent: Int64s
+    renaming: Int64s
+    names: Int64s
 
 
-def recently(recent: Integers, agent: Integers, number: int) -> Integers:
+def recently(recent: Int64s, agent: Int64s, number: int) -> Int64s:
     """The last detections of every agent [W, A, L], oldest first, -1 for none, when `agent` was given `number`."""
     out = recent.copy()
     rows = np.flatnonzero(agent != CLUTTER)
@@ -50,7 +47,7 @@ def recently(recent: Integers, agent: Integers, number: int) -> Integers:
     return out
 
 
-def grouped(recent: Integers) -> tuple[Integers, Integers]:
+def grouped(recent: Int64s) -> tuple[Int64s, Int64s]:
     """Which of W ways agree on the last detections of all agents [W, A, L], whatever they call them.
 
     Returns:
@@ -63,8 +60,8 @@ def grouped(recent: Integers) -> tuple[Integers, Integers]:
 
 
 def step_of(
-    weight: Floats, parent: Integers, agent: Integers, group: Integers, order: Integers, child_of_group: Integers
-) -> tuple[Step, Integers]:
+    weight: Float64s, parent: Int64s, agent: Int64s, group: Int64s, order: Int64s, child_of_group: Int64s
+) -> tuple[Step, Int64s]:
     """The edges of W weighted ways [W] whose groups became children (-1: of no child), and the heaviest way of each child."""
     heaviest_first = np.lexsort((-weight, group))
     first_of_group = heaviest_first[np.searchsorted(group[heaviest_first], np.arange(len(child_of_group)))]
@@ -86,7 +83,7 @@ def step_of(
     )
 
 
-def drawn_ways(steps: Sequence[Step], particle: Integers, generator: np.random.Generator) -> Integers:
+def drawn_ways(steps: Sequence[Step], particle: Int64s, generator: np.random.Generator) -> Int64s:
     """Labels [M, N] of one way for each of M particles after the last step, drawn from all that led there."""
     rows = np.arange(len(particle))
     label = np.empty((len(particle), len(steps)), dtype=np.int64)

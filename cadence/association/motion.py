@@ -7,9 +7,8 @@ and dp = v dt; all integrals in closed form (Särkkä and Solin, "Applied Stocha
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from cadence.arrays import Float64s
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,9 +21,9 @@ class Modes:
     switch_share  an agent takes up a mode anew, by `share`, at this share of its detections
     """
 
-    relaxation_s: Floats
-    speed_mps: Floats
-    share: Floats
+    relaxation_s: Float64s
+    speed_mps: Float64s
+    share: Float64s
     switch_share: float
 
     def __post_init__(self) -> None:
@@ -40,14 +39,14 @@ class Modes:
 class Motion:
     """Moments of the way between two moments: p' = p + gain v, v' = decay v, and the noise; each [..., C]."""
 
-    gain: Floats
-    decay: Floats
-    noise_pp: Floats
-    noise_pv: Floats
-    noise_vv: Floats
+    gain: Float64s
+    decay: Float64s
+    noise_pp: Float64s
+    noise_pv: Float64s
+    noise_vv: Float64s
 
 
-def motion(modes: Modes, duration_s: Floats) -> Motion:
+def motion(modes: Modes, duration_s: Float64s) -> Motion:
     """Moments over durations [...], one for every mode."""
     x = duration_s[..., None] / modes.relaxation_s
     forgotten = -np.expm1(-x)

@@ -6,18 +6,16 @@ early, by an exchange of two agents, names are to say who is where now.
 """
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
+from cadence.arrays import Int64s
 from cadence.association.types import CLUTTER
-
-Integers = NDArray[np.int64]
 
 _FORGETTING = 0.8
 """What a detection counts, to the power of how many later ones of the same agent there are, in either way."""
 
 
-def named_like(label: Integers, reference: Integers) -> Integers:
+def named_like(label: Int64s, reference: Int64s) -> Int64s:
     """The labels [N] renamed after a reference [N'] for the first N' detections; agents without overlap get free names.
 
     Free names are the smallest that no agent of this way has got, so that as few as possible are used in all.
@@ -39,7 +37,7 @@ def named_like(label: Integers, reference: Integers) -> Integers:
     return np.asarray(name[label], dtype=np.int64)
 
 
-def _num_later(label: Integers) -> Integers:
+def _num_later(label: Int64s) -> Int64s:
     """How many later detections [N] have the same label."""
     order = np.argsort(label[::-1], kind="stable")
     grouped = label[::-1][order]

@@ -10,16 +10,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cadence.arrays import Bools, Float64s, Int64s
 from cadence.association.history import Step, drawn_ways, grouped, recently, step_of
 from cadence.association.presence import Habits, log_hazards, log_silence_between
 from cadence.association.tracks import Detection, Tracks, log_densities, updated
 from cadence.association.types import CLUTTER
 from cadence.resampling import resample
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 NUM_RECENT = 3
 """An agent's last detections from which its future follows: older ones say little that these do not."""
@@ -37,9 +34,9 @@ class Stream:
     covariance_m2 [N, 2, 2] symmetric positive semi-definite
     """
 
-    time_s: Floats
-    position_m: Floats
-    covariance_m2: Floats
+    time_s: Float64s
+    position_m: Float64s
+    covariance_m2: Float64s
 
     def __post_init__(self) -> None:
         n = len(self.time_s)
@@ -65,13 +62,13 @@ class Particles:
     log_evidence  log density of the detections so far
     """
 
-    weight: Floats
+    weight: Float64s
     tracks: Tracks
-    recent: Integers
+    recent: Int64s
     steps: list[Step]
     log_evidence: float
 
-    def ways(self, particle: Integers, generator: np.random.Generator) -> Integers:
+    def ways(self, particle: Int64s, generator: np.random.Generator) -> Int64s:
         """Labels [M, N] of one way for each of M particles, drawn from its pasts."""
         return drawn_ways(self.steps, particle, generator)
 
@@ -123,13 +120,13 @@ def _next(
     return Particles(new_weight, after, recent[way], particles.steps, log_evidence)
 
 
-def _with_room(recent: Integers, num_slots: int) -> Integers:
+def _with_room(recent: Int64s, num_slots: int) -> Int64s:
     """The same with room for so many agents at least."""
     more = max(num_slots - recent.shape[1], 0)
     return np.pad(recent, [(0, 0), (0, more), (0, 0)], constant_values=-1)
 
 
-def continuations(tracks: Tracks, habits: Habits, seen: Detection, before_s: float) -> Floats:
+def continuations(tracks: Tracks, habits: Habits, seen: Detection, before_s: float) -> Float64s:
     """Log density [P, A + 2] of the silence up to the detection and of the detection from each agent, a new one, or nobody."""
     out = log_hazards(tracks, habits, seen.time_s) + log_silence_between(tracks, habits, before_s, seen.time_s)[:, None]
     out[:, :-2] += habits.temper * log_densities(tracks, habits.modes, seen)
@@ -139,7 +136,7 @@ def continuations(tracks: Tracks, habits: Habits, seen: Detection, before_s: flo
     return out
 
 
-def is_too_fast(tracks: Tracks, habits: Habits, seen: Detection) -> NDArray[np.bool_]:
+def is_too_fast(tracks: Tracks, habits: Habits, seen: Detection) -> Bools:
     """Agents [P, A] that would have to exceed the speed limit by more than four standard deviations to be seen here."""
     place = (np.exp(tracks.log_share)[..., None] * tracks.mean[..., :2]).sum(-2)
     variance = tracks.covariance[..., 0, 0].max(-1) + tracks.covariance[..., 1, 1].max(-1) + np.trace(seen.covariance_m2)

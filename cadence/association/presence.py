@@ -10,12 +10,10 @@ seconds since the first detection.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cadence.arrays import Float64s
 from cadence.association.motion import Modes
 from cadence.association.tracks import Tracks
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +50,7 @@ class Habits:
     max_speed_mps: float | None
 
 
-def log_silence(tracks: Tracks, habits: Habits, time_s: float) -> tuple[Floats, Floats]:
+def log_silence(tracks: Tracks, habits: Habits, time_s: float) -> tuple[Float64s, Float64s]:
     """For every agent [P, A]: log probability of no detection from its last one to `time_s`, and log density of one just then.
 
     An agent that stays is silent with probability (1 + silent / watched) ^ -count (a Poisson process whose rate has a gamma
@@ -65,13 +63,13 @@ def log_silence(tracks: Tracks, habits: Habits, time_s: float) -> tuple[Floats, 
     return np.where(total > 0, silence, 0.0), np.log(count / watched_s) - total
 
 
-def left_by(tracks: Tracks, habits: Habits, time_s: float) -> Floats:
+def left_by(tracks: Tracks, habits: Habits, time_s: float) -> Float64s:
     """Probability that an agent has left, given its silence from its last detection to `time_s` [P, A]."""
     _, _, unseen, left = _waiting(tracks, habits, time_s)
     return np.asarray(1.0 - np.exp(-unseen - left - log_silence(tracks, habits, time_s)[0]))
 
 
-def _waiting(tracks: Tracks, habits: Habits, time_s: float) -> tuple[Floats, Floats, Floats, Floats]:
+def _waiting(tracks: Tracks, habits: Habits, time_s: float) -> tuple[Float64s, Float64s, Float64s, Float64s]:
     """Evidence of each agent's rate at `time_s` (detections, seconds), and minus the log probabilities of silence and stay."""
     silent_s = np.maximum(time_s - tracks.last_s, 0.0)
     watched_s = habits.rate_weight / habits.rate_hz + tracks.watched_s
@@ -79,14 +77,14 @@ def _waiting(tracks: Tracks, habits: Habits, time_s: float) -> tuple[Floats, Flo
     return count, watched_s + silent_s, count * np.log1p(silent_s / watched_s), habits.leave_hz * silent_s
 
 
-def log_silence_between(tracks: Tracks, habits: Habits, begin_s: float, end_s: float) -> Floats:
+def log_silence_between(tracks: Tracks, habits: Habits, begin_s: float, end_s: float) -> Float64s:
     """Log probability that nobody was detected from `begin_s` to `end_s`, given the detections up to `begin_s` [P]."""
     is_met = np.arange(tracks.last_s.shape[1]) < tracks.num_agents[:, None]
     silence = log_silence(tracks, habits, end_s)[0] - log_silence(tracks, habits, begin_s)[0]
     return np.asarray(np.where(is_met, silence, 0.0).sum(1) - _num_new(tracks, habits, begin_s, end_s))
 
 
-def log_hazards(tracks: Tracks, habits: Habits, time_s: float) -> Floats:
+def log_hazards(tracks: Tracks, habits: Habits, time_s: float) -> Float64s:
     """Log rates [P, A + 2] at which the next detection comes: from each agent, a new one, or from nobody.
 
     An agent that was detected at this very moment is not detected twice.
@@ -102,7 +100,7 @@ def log_hazards(tracks: Tracks, habits: Habits, time_s: float) -> Floats:
     return hazards
 
 
-def _new_hz(tracks: Tracks, habits: Habits, time_s: float) -> Floats:
+def _new_hz(tracks: Tracks, habits: Habits, time_s: float) -> Float64s:
     """Rate at which an agent is met for the first time [P]; where their number is unknown: there at first, or come later."""
     if habits.num_agents is not None:
         return np.asarray((habits.num_agents - tracks.num_agents) * habits.rate_hz)
@@ -111,7 +109,7 @@ def _new_hz(tracks: Tracks, habits: Habits, time_s: float) -> Floats:
     return np.where(tracks.num_agents < habits.max_agents, new_hz, 0.0)
 
 
-def _num_new(tracks: Tracks, habits: Habits, begin_s: float, end_s: float) -> Floats:
+def _num_new(tracks: Tracks, habits: Habits, begin_s: float, end_s: float) -> Float64s:
     """The integral of `_new_hz` [P]."""
     if habits.num_agents is not None:
         return _new_hz(tracks, habits, begin_s) * (end_s - begin_s)

@@ -5,12 +5,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cadence.arrays import Float64s, Int64s
 from cadence.association.motion import Modes, motion
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,13 +23,13 @@ class Tracks:
     num_agents  [P] agents met so far
     """
 
-    mean: Floats
-    covariance: Floats
-    log_share: Floats
-    last_s: Floats
-    repeats: Floats
-    watched_s: Floats
-    num_agents: Integers
+    mean: Float64s
+    covariance: Float64s
+    log_share: Float64s
+    last_s: Float64s
+    repeats: Float64s
+    watched_s: Float64s
+    num_agents: Int64s
 
     @classmethod
     def none(cls, num_modes: int) -> "Tracks":
@@ -47,7 +44,7 @@ class Tracks:
             np.zeros(1, dtype=np.int64),
         )
 
-    def __getitem__(self, particles: Integers) -> "Tracks":
+    def __getitem__(self, particles: Int64s) -> "Tracks":
         """A selection of particles; repeats are allowed."""
         return Tracks(**{field.name: getattr(self, field.name)[particles] for field in dataclasses.fields(self)})
 
@@ -68,11 +65,11 @@ class Detection:
     """One detection: seconds, metres [2], covariance [2, 2]."""
 
     time_s: float
-    position_m: Floats
-    covariance_m2: Floats
+    position_m: Float64s
+    covariance_m2: Float64s
 
 
-def log_densities(tracks: Tracks, modes: Modes, seen: Detection) -> Floats:
+def log_densities(tracks: Tracks, modes: Modes, seen: Detection) -> Float64s:
     """Log density of the detection under every agent [P, A], per square metre; only agents that were met have a meaning."""
     way = motion(modes, seen.time_s - tracks.last_s)
     gain = way.gain[..., None]
@@ -95,7 +92,7 @@ def log_densities(tracks: Tracks, modes: Modes, seen: Detection) -> Floats:
     return np.asarray((peak + np.log(np.exp(density - peak).sum(-1, keepdims=True)))[..., 0])
 
 
-def updated(tracks: Tracks, modes: Modes, seen: Detection, agent: Integers, memory: float = 1.0) -> Tracks:
+def updated(tracks: Tracks, modes: Modes, seen: Detection, agent: Int64s, memory: float = 1.0) -> Tracks:
     """The particles after the detection was given to `agent` [P]: one that was met, the next new one, or -1, nobody.
 
     With each detection of an agent the earlier ones count `memory` times as much for how often it is detected.
@@ -117,7 +114,7 @@ def updated(tracks: Tracks, modes: Modes, seen: Detection, agent: Integers, memo
     return out
 
 
-def _first(modes: Modes, seen: Detection) -> tuple[Floats, Floats, Floats]:
+def _first(modes: Modes, seen: Detection) -> tuple[Float64s, Float64s, Float64s]:
     """State of an agent that was met just now: [C, 4], [C, 4, 4], [C]."""
     mean = np.zeros((len(modes), 4))
     mean[:, :2] = seen.position_m
@@ -127,7 +124,9 @@ def _first(modes: Modes, seen: Detection) -> tuple[Floats, Floats, Floats]:
     return mean, covariance, np.log(modes.share)
 
 
-def _kalman(tracks: Tracks, modes: Modes, seen: Detection, rows: Integers, columns: Integers) -> tuple[Floats, Floats, Floats]:
+def _kalman(
+    tracks: Tracks, modes: Modes, seen: Detection, rows: Int64s, columns: Int64s
+) -> tuple[Float64s, Float64s, Float64s]:
     """Predicted and updated state of one known agent in each of R particles, modes mixed afterwards."""
     way = motion(modes, seen.time_s - tracks.last_s[rows, columns])
     before, spread = tracks.mean[rows, columns], tracks.covariance[rows, columns]
@@ -155,7 +154,7 @@ def _kalman(tracks: Tracks, modes: Modes, seen: Detection, rows: Integers, colum
     return _mixed(mean, 0.5 * (covariance + covariance.swapaxes(-1, -2)), share / share.sum(-1, keepdims=True), modes)
 
 
-def _mixed(mean: Floats, covariance: Floats, share: Floats, modes: Modes) -> tuple[Floats, Floats, Floats]:
+def _mixed(mean: Float64s, covariance: Float64s, share: Float64s, modes: Modes) -> tuple[Float64s, Float64s, Float64s]:
     """States after the agent may have taken up another mode (interacting multiple models, Blom and Bar-Shalom 1988)."""
     overall = (share[..., None] * mean).sum(-2, keepdims=True)
     apart = mean - overall
@@ -169,5 +168,5 @@ def _mixed(mean: Floats, covariance: Floats, share: Floats, modes: Modes) -> tup
     return mixed, stays[..., None, None] * spread + comes[..., None, None] * other, np.log(mixed_share)
 
 
-def _outer(vector: Floats) -> Floats:
+def _outer(vector: Float64s) -> Float64s:
     return vector[..., :, None] * vector[..., None, :]

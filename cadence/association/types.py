@@ -3,7 +3,8 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+
+from cadence.arrays import Float64s, Int64s
 
 CLUTTER = -1
 """Label of a detection that no agent caused."""
@@ -44,8 +45,8 @@ class Associations:
     num_agents  agents that are numbered in the log as a whole; some may have no detection yet
     """
 
-    label: NDArray[np.int64]
-    weight: NDArray[np.float64]
+    label: Int64s
+    weight: Float64s
     num_agents: int
 
     def __post_init__(self) -> None:
@@ -69,7 +70,7 @@ class Associations:
         return int(self.label.shape[1])
 
 
-def agent_probability(associations: Associations) -> NDArray[np.float64]:
+def agent_probability(associations: Associations) -> Float64s:
     """P(detection came from agent) [N, A + 1], rows sum to one; the last column is clutter."""
     num_agents = associations.num_agents
     out = np.zeros((associations.num_detections, num_agents + 1))

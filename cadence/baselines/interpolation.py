@@ -12,10 +12,10 @@ from typing import Self
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from scipy.optimize import minimize
 from torch import Tensor
 
+from cadence.arrays import Float64s
 from cadence.types import Detections, HypothesisSet, WindowBatch
 
 _MAX_RESIDUALS = 2000
@@ -290,13 +290,13 @@ def _fit_law(residuals: _Residuals, fallback: GapLaw) -> GapLaw:
     typical_s, longest_s = float(residuals.gap_s.log().mean().exp()), float(residuals.gap_s.max())
     level = 0.5 * math.log(float((weight * residuals.squared_m2).sum()) + 1e-12)
 
-    def law(parameters: NDArray[np.float64]) -> GapLaw:
+    def law(parameters: Float64s) -> GapLaw:
         # The level at the typical gap, not at one second: there it hardly depends on the exponent.
         exponent = float(np.clip(parameters[1], 0.05, 2.0))
         scale_m = math.exp(float(np.clip(parameters[0], -30.0, 30.0))) / typical_s**exponent
         return GapLaw(scale_m, exponent, math.exp(float(np.clip(parameters[2], -30.0, 30.0))))
 
-    def cost(parameters: NDArray[np.float64]) -> float:
+    def cost(parameters: Float64s) -> float:
         variance = law(parameters).variance(residuals.gap_s) * residuals.part + residuals.noise_m2 + 1e-12
         return float((weight * (variance.log() + residuals.squared_m2 / variance)).sum())
 

@@ -13,15 +13,12 @@ from typing import Self
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
+from cadence.arrays import Float64s, Int64s
 from cadence.bank.rows import active_rows, scatter_hypotheses
 from cadence.resampling import candidates_at, systematic
 from cadence.types import Context, Detections, HypothesisSet, WindowBatch
 from cadence.worlds.recordings import Recordings
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 _REACH = 3.5
 """Standard deviations of the last detection's kernel beyond which a state is not looked at."""
@@ -104,19 +101,19 @@ class _States:
     median way of a step in which a target moved, the unit of the kernels' lengths.
     """
 
-    cell: Indices
+    cell: Int64s
     cell_m: float
-    corner_m: Array
+    corner_m: Float64s
     num_rows: int
-    row: Indices
-    episode: Indices
-    step: Indices
-    left: Indices
-    num_recent: Array
-    age: Indices
+    row: Int64s
+    episode: Int64s
+    step: Int64s
+    left: Int64s
+    num_recent: Float64s
+    age: Int64s
     length_m: float
 
-    def around(self, place_m: Array, reach_m: float) -> Indices:
+    def around(self, place_m: Float64s, reach_m: float) -> Int64s:
         """States in all cells that the square of `reach_m` around a place [2] touches."""
         low = np.floor((place_m - reach_m - self.corner_m) / self.cell_m).astype(np.int64)
         high = np.floor((place_m + reach_m - self.corner_m) / self.cell_m).astype(np.int64)
@@ -181,12 +178,12 @@ class _Query:
     `count_steps` up to it; elapsed and goal_m [2] are None and NaN where unknown.
     """
 
-    lag: Indices
-    position_m: Array
+    lag: Int64s
+    position_m: Float64s
     age: int
     num_recent: int
     elapsed: float | None
-    goal_m: Array
+    goal_m: Float64s
 
 
 @dataclass(frozen=True, eq=False)
@@ -242,7 +239,7 @@ class TrajectoryLibrary:
             sample_m[row] = self._continued(query, state[drawn], steps) - datum_m
         return scatter_hypotheses(torch.from_numpy(sample_m), windows)
 
-    def _query(self, age: Indices, position_m: Array, window: int, agent: int) -> _Query:
+    def _query(self, age: Int64s, position_m: Float64s, window: int, agent: int) -> _Query:
         """What is compared of the detections [N], newest first, and of the context."""
         context, lag = self.context, age - age[0]
         assert context is not None
@@ -254,7 +251,7 @@ class TrajectoryLibrary:
         recent = int((lag < self.config.count_steps).sum())
         return _Query(lag[chosen], position_m[chosen], int(age[0]), recent, elapsed, goal_m)
 
-    def _weighted(self, query: _Query) -> tuple[Indices, Array]:
+    def _weighted(self, query: _Query) -> tuple[Int64s, Float64s]:
         """States that may continue the window [M] and their weights [M], which sum to one."""
         sigma_m = self.states.length_m * (self.config.sigma + self.config.sigma_per_age * query.age)
         state = self._nearby(query, sigma_m)
@@ -267,7 +264,7 @@ class TrajectoryLibrary:
         log_weight = log_weight + self._log_course(query, state, sigma_m)
         return state, _flattened(log_weight, self.states.episode[state], self.config.min_episodes)
 
-    def _nearby(self, query: _Query, sigma_m: float) -> Indices:
+    def _nearby(self, query: _Query, sigma_m: float) -> Int64s:
         """States near the last detection whose episodes go on until now: the target has not arrived yet."""
         states = self.states
         state = states.around(query.position_m[0], _REACH * sigma_m)
@@ -282,7 +279,7 @@ class TrajectoryLibrary:
         distance_m = np.square(self.recordings.position_m[states.row[going_on]] - query.position_m[0]).sum(axis=1)
         return going_on[np.argpartition(distance_m, _NUM_NEAREST)[:_NUM_NEAREST]]
 
-    def _log_circumstances(self, query: _Query, state: Indices) -> Array:
+    def _log_circumstances(self, query: _Query, state: Int64s) -> Float64s:
         """Kernels over everything but the places of the detections [M]."""
         config, states = self.config, self.states
         log_weight = np.zeros(len(state))
@@ -301,19 +298,19 @@ class TrajectoryLibrary:
             log_weight -= np.where(is_other[states.episode[state]], config.goal_penalty, 0.0)
         return log_weight
 
-    def _log_course(self, query: _Query, state: Indices, sigma_m: float) -> Array:
+    def _log_course(self, query: _Query, state: Int64s, sigma_m: float) -> Float64s:
         """Kernels over the places of the detections [M]; before its beginning a recorded target waits where it begins."""
         back = np.minimum(query.lag, self.states.step[state][:, None])
         offset_m = self.recordings.position_m[self.states.row[state][:, None] - back] - query.position_m
         sigmas_m = sigma_m + self.config.sigma_per_lag * self.states.length_m * query.lag
-        log_weight: Array = -0.5 * (np.square(offset_m).sum(axis=2) / np.square(sigmas_m)).sum(axis=1)
+        log_weight: Float64s = -0.5 * (np.square(offset_m).sum(axis=2) / np.square(sigmas_m)).sum(axis=1)
         return log_weight
 
-    def _continued(self, query: _Query, state: Indices, steps: Indices) -> Array:
+    def _continued(self, query: _Query, state: Int64s, steps: Int64s) -> Float64s:
         """Places [K, T, 2] of the states' episodes at `steps` [T] from now, shifted; parked after their end."""
         row = self.states.row[state]
         since = np.clip(query.age + steps, -self.states.step[state][:, None], self.states.left[state][:, None])
-        place_m: Array = self.recordings.position_m[row[:, None] + since].astype(np.float64)
+        place_m: Float64s = self.recordings.position_m[row[:, None] + since].astype(np.float64)
         if self.config.fade > 0.0:
             part = np.maximum(0.0, 1.0 - np.abs(query.age + steps) / self.config.fade)
             shift_m = query.position_m[0] - self.recordings.position_m[row]
@@ -321,7 +318,7 @@ class TrajectoryLibrary:
         return place_m
 
 
-def spaced_lags(lag: Indices, count: int, growth: float) -> Indices:
+def spaced_lags(lag: Int64s, count: int, growth: float) -> Int64s:
     """Places of at most `count` of the lags [N] (rising from 0), each at least `growth` times the one before it.
 
     With a growth of 1 the first `count` in a row.
@@ -338,7 +335,7 @@ def spaced_lags(lag: Indices, count: int, growth: float) -> Indices:
     return np.array(chosen)
 
 
-def _flattened(log_weight: Array, episode: Indices, min_episodes: float) -> Array:
+def _flattened(log_weight: Float64s, episode: Int64s, min_episodes: float) -> Float64s:
     """Weights [M] proportional to exp(log_weight / T), T >= 1 the least that gives so many effective episodes.
 
     Neighbouring states of one episode tell the same: their weights are added before 1 / sum w^2 is taken.
@@ -346,9 +343,9 @@ def _flattened(log_weight: Array, episode: Indices, min_episodes: float) -> Arra
     log_weight = log_weight - log_weight.max()
     _, member = np.unique(episode, return_inverse=True)
 
-    def weights(temperature: float) -> Array:
+    def weights(temperature: float) -> Float64s:
         weight = np.exp(log_weight / temperature)
-        shares: Array = weight / weight.sum()
+        shares: Float64s = weight / weight.sum()
         return shares
 
     def is_enough(temperature: float) -> bool:
@@ -363,8 +360,8 @@ def _flattened(log_weight: Array, episode: Indices, min_episodes: float) -> Arra
     return weights(high)
 
 
-def _draw(weight: Array, number: int, rng: np.random.Generator, is_systematic: bool) -> Indices:
+def _draw(weight: Float64s, number: int, rng: np.random.Generator, is_systematic: bool) -> Int64s:
     """Indices [K] drawn with the weights [M], in random order."""
     drawn = systematic(weight, number, rng.random()) if is_systematic else candidates_at(weight, rng.random(number))
-    shuffled: Indices = rng.permutation(drawn)
+    shuffled: Int64s = rng.permutation(drawn)
     return shuffled

@@ -16,12 +16,11 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.special import ndtri
 
+from cadence.arrays import Float64s, Int64s
 from cadence.bank.rows import active_rows, scatter_hypotheses
 from cadence.resampling import systematic
 from cadence.types import Context, Detections, HypothesisSet, WindowBatch
 from cadence.worlds.recordings import Recordings
-
-Array = NDArray[np.float64]
 
 _BLOCK = 8
 """Steps over which speed and heading are measured: paths on a grid waver from step to step."""
@@ -44,7 +43,7 @@ class RandomTurn:
     """
 
     step_s: float
-    speed_m: Array
+    speed_m: Float64s
     speed_rate: float
     turn_rate: float
     turn_sigma: float
@@ -85,7 +84,7 @@ class RandomTurn:
         """Root mean square way of a step, metres."""
         return float(np.sqrt(np.square(self.speed_m).mean()))
 
-    def run(self, state: "_Particles", num_steps: int, rng: np.random.Generator) -> tuple[Array, "_Particles"]:
+    def run(self, state: "_Particles", num_steps: int, rng: np.random.Generator) -> tuple[Float64s, "_Particles"]:
         """Places [T, P, 2] of P particles after 1 ... `num_steps` steps, and their states after the last."""
         number = len(state.heading)
         chance = rng.random((num_steps, number))
@@ -108,11 +107,11 @@ class RandomTurn:
 class _Particles:
     """P particles: place_m [P, 2], heading [P] radians from the x axis, speed_m [P] metres a step."""
 
-    place_m: Array
-    heading: Array
-    speed_m: Array
+    place_m: Float64s
+    heading: Float64s
+    speed_m: Float64s
 
-    def __getitem__(self, index: NDArray[np.int64]) -> "_Particles":
+    def __getitem__(self, index: Int64s) -> "_Particles":
         return _Particles(self.place_m[index], self.heading[index], self.speed_m[index])
 
 
@@ -176,7 +175,7 @@ class ParticleFilter:
             sample_m[row] = self._forecast(chosen, int(age[-1]), windows.num_steps, rng)
         return scatter_hypotheses(torch.from_numpy(sample_m), windows)
 
-    def _filtered(self, age: NDArray[np.int64], place_m: Array, noise_m2: Array, rng: np.random.Generator) -> _Particles:
+    def _filtered(self, age: Int64s, place_m: Float64s, noise_m2: Float64s, rng: np.random.Generator) -> _Particles:
         """Equally weighted particles at the last of the detections [N], oldest first."""
         number, motion = self.num_particles, self.motion
         root = np.linalg.cholesky(noise_m2)
@@ -194,7 +193,7 @@ class ParticleFilter:
         return particles
 
     def _updated(
-        self, particles: _Particles, place_m: Array, noise_m2: Array, kernel_m: float, rng: np.random.Generator
+        self, particles: _Particles, place_m: Float64s, noise_m2: Float64s, kernel_m: float, rng: np.random.Generator
     ) -> _Particles:
         """Particles after a detection at place_m [2]: weighted, resampled, and moved within their kernels."""
         kernel_m2 = kernel_m**2 * np.eye(2)
@@ -208,7 +207,7 @@ class ParticleFilter:
         heading = particles.heading[chosen] + self.roughening * rng.standard_normal(len(chosen))
         return _Particles(moved, heading, particles.speed_m[chosen])
 
-    def _forecast(self, particles: _Particles, age: int, num_steps: int, rng: np.random.Generator) -> Array:
+    def _forecast(self, particles: _Particles, age: int, num_steps: int, rng: np.random.Generator) -> Float64s:
         """Places [K, T, 2] from `age` steps after the particles on. The target has not arrived before the origin."""
         place, _ = self.motion.run(particles, age + num_steps - 1, rng)
         place = np.concatenate([particles.place_m[None], place])[age:]
@@ -217,7 +216,7 @@ class ParticleFilter:
         return np.take_along_axis(place, index[..., None], axis=0).transpose(1, 0, 2)
 
 
-def _blocks(recordings: Recordings) -> tuple[NDArray[np.complex128], NDArray[np.int64]]:
+def _blocks(recordings: Recordings) -> tuple[NDArray[np.complex128], Int64s]:
     """Mean velocities of all whole blocks of steps as complex numbers [N], metres a step, and their episodes [N]."""
     num_blocks = (recordings.length - 1) // _BLOCK
     episode = np.repeat(np.arange(len(num_blocks)), num_blocks)
@@ -227,7 +226,7 @@ def _blocks(recordings: Recordings) -> tuple[NDArray[np.complex128], NDArray[np.
     return move[:, 0] + 1j * move[:, 1], episode
 
 
-def _fit_speed_rate(speed: Array, episode: NDArray[np.int64]) -> float:
+def _fit_speed_rate(speed: Float64s, episode: Int64s) -> float:
     """Rate of a new speed a step: least squares of the autocorrelation with waver exp(-rate lag)."""
     variance = speed.var()
     lags = [lag for lag in _LAGS if (episode[lag:] == episode[:-lag]).any()]
@@ -245,7 +244,7 @@ def _fit_speed_rate(speed: Array, episode: NDArray[np.int64]) -> float:
     return float(rates[np.square(share[:, None] * shape - correlation).sum(axis=1).argmin()])
 
 
-def _fit_turns(velocity: NDArray[np.complex128], episode: NDArray[np.int64]) -> tuple[float, float, float]:
+def _fit_turns(velocity: NDArray[np.complex128], episode: Int64s) -> tuple[float, float, float]:
     """Rate of turns a step, their standard deviation and that of the drift in a step."""
     speed = np.abs(velocity)
     # the heading of a target that hardly moves is noise
@@ -262,7 +261,7 @@ def _fit_turns(velocity: NDArray[np.complex128], episode: NDArray[np.int64]) -> 
         return 0.0, 1.0, 0.0
     lag_steps, order = np.array(lags)[:, None], np.array([1.0, 4.0])
 
-    def cost(parameters: Array) -> float:
+    def cost(parameters: Float64s) -> float:
         rate, turn, drift, waver = np.exp(np.clip(parameters, -12.0, [-1.0, 1.2, 0.0, 0.0]))
         decay = rate * (1.0 - np.exp(-0.5 * order * turn**2)) + 0.5 * order * drift**2
         return float(np.square(np.exp(-lag_steps * decay - order * waver**2) - np.array(cosines)).sum())

@@ -10,8 +10,8 @@ from typing import Self
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
+from cadence.arrays import Int64s
 from cadence.baselines.kalman import ConstantVelocityKalman, OrnsteinUhlenbeckKalman
 from cadence.types import Context, Detections, HypothesisSet, WindowBatch
 from cadence.worlds.recordings import Recordings
@@ -127,7 +127,7 @@ def detection_stretches(recordings: Recordings, spacing: int, num_detections: in
     The beginning counts as a detection. Positions are relative to each stretch's first, exact; at most 400 stretches, evenly
     chosen.
     """
-    stretches: list[NDArray[np.int64]] = []
+    stretches: list[Int64s] = []
     for begin, end in zip(recordings.offset[:-1], recordings.offset[1:], strict=True):
         found = np.unique(np.concatenate([[0], np.flatnonzero(recordings.is_detected[begin:end])]))
         kept = [0]

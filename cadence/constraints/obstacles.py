@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 import shapely
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
+
+from cadence.arrays import Bools, Float64s, Indices, Objects
 
 _CHUNK = 4_000_000
 """Point-obstacle pairs evaluated at once: bounds the memory at some hundred MB."""
@@ -56,12 +57,12 @@ class Obstacles:
         return len(self.circles) + len(self.polygons)
 
     @cached_property
-    def circle_array(self) -> NDArray[np.float64]:
+    def circle_array(self) -> Float64s:
         """The circles as numpy [M, 3]."""
         return self.circles.detach().cpu().numpy().astype(np.float64)
 
     @cached_property
-    def shapes(self) -> NDArray[np.object_]:
+    def shapes(self) -> Objects:
         """The polygons as prepared shapely polygons [P], exterior counter-clockwise, holes clockwise."""
         rings = [[ring.detach().cpu().numpy().astype(np.float64) for ring in polygon] for polygon in self.polygons]
         shapes = np.empty(len(rings), dtype=object)
@@ -206,7 +207,7 @@ def _merge_polygons(position_m: Tensor, obstacles: Obstacles, limit_m: float, di
     gradient.copy_(torch.from_numpy(slope))
 
 
-def _may_be_near(point: NDArray[np.float64], boxes: NDArray[np.float64], limit_m: float) -> NDArray[np.bool_]:
+def _may_be_near(point: Float64s, boxes: Float64s, limit_m: float) -> Bools:
     """A quick look at which points [N, 2] are within limit_m of a box [P, 4]; all of them where there are many boxes."""
     if len(boxes) > _FEW_POLYGONS or not np.isfinite(limit_m):
         return np.ones(len(point), dtype=bool)
@@ -218,11 +219,11 @@ def _may_be_near(point: NDArray[np.float64], boxes: NDArray[np.float64], limit_m
 
 
 def _lower(
-    best: NDArray[np.float64],
-    slope: NDArray[np.float64],
-    index: NDArray[np.intp],
-    distance: NDArray[np.float64],
-    gradient: NDArray[np.float64],
+    best: Float64s,
+    slope: Float64s,
+    index: Indices,
+    distance: Float64s,
+    gradient: Float64s,
 ) -> None:
     nearer = distance < best[index]
     best[index[nearer]] = distance[nearer]
@@ -240,14 +241,14 @@ class _EdgeIndex:
         self.along = edges[:, 1] - edges[:, 0]
         self.tree = shapely.STRtree(shapely.linestrings(edges))
 
-    def near(self, point: NDArray[np.float64], limit_m: float) -> NDArray[np.intp]:
+    def near(self, point: Float64s, limit_m: float) -> Indices:
         """Indices of the points [N, 2] that may be nearer than limit_m to an edge."""
         if not np.isfinite(limit_m):
             return np.arange(len(point))
         low, high = (point - limit_m).T, (point + limit_m).T
         return np.unique(self.tree.query(shapely.box(*low, *high))[0])
 
-    def nearest(self, point: NDArray[np.float64], sign: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def nearest(self, point: Float64s, sign: float) -> tuple[Float64s, Float64s]:
         """Signed distance [N] to the nearest edge and its gradient [N, 2]; sign -1 for points inside."""
         if not len(point):
             return np.zeros(0), np.zeros((0, 2))

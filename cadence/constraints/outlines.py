@@ -5,14 +5,12 @@ from typing import Any
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 
+from cadence.arrays import Float64s, Objects
 from cadence.constraints.obstacles import Obstacles
 
-FloatArray = NDArray[np.float64]
 
-
-def polygon_parts(shape: Any) -> NDArray[np.object_]:
+def polygon_parts(shape: Any) -> Objects:
     """The polygons of a geometry, interiors to the left of every ring."""
     polygons = [part for part in shapely.get_parts(shape) if part.geom_type == "Polygon" and not part.is_empty]
     parts = np.empty(len(polygons), dtype=object)
@@ -41,7 +39,7 @@ def _discs(obstacles: Obstacles, distance_m: float, sides: int, stretch: float =
     return [shapely.Polygon(row[:2] + stretch * (row[2] + distance_m) * unit) for row in obstacles.circle_array]
 
 
-def convex_bends(shape: Any) -> Iterator[FloatArray]:
+def convex_bends(shape: Any) -> Iterator[Float64s]:
     """For every ring of polygons, its corners that stick out, between their neighbours [V, 3, 2]."""
     for part in polygon_parts(shape):
         for ring in (part.exterior, *part.interiors):
@@ -50,7 +48,7 @@ def convex_bends(shape: Any) -> Iterator[FloatArray]:
             yield bends[cross(corner - bends[:, 0], bends[:, 2] - corner) > 0]
 
 
-def loose_bends(part: Any, clearance_m: float) -> FloatArray:
+def loose_bends(part: Any, clearance_m: float) -> Float64s:
     """Ten bends [10, 3, 2] around a component for tracks with few steps: four close to it, six far out."""
     rectangle = shapely.minimum_rotated_rectangle(part)
     angle = np.arange(6) * (np.pi / 3)
@@ -61,7 +59,7 @@ def loose_bends(part: Any, clearance_m: float) -> FloatArray:
     return np.stack([np.full_like(loose, np.nan), loose, np.full_like(loose, np.nan)], axis=1)
 
 
-def cross(a: FloatArray, b: FloatArray) -> FloatArray:
+def cross(a: Float64s, b: Float64s) -> Float64s:
     """Cross product [...] of vectors [..., 2]: positive where b points to the left of a."""
-    product: FloatArray = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+    product: Float64s = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
     return product

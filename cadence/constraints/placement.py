@@ -1,24 +1,23 @@
 """When a track is where on its new way: steps laid along a path with the rhythm of the old one, corners hit exactly."""
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from cadence.arrays import Float64s
 
 
-def arc_length(path: FloatArray) -> FloatArray:
+def arc_length(path: Float64s) -> Float64s:
     """Length [P] walked at every vertex of a path [P, 2]."""
     step = np.diff(path, axis=0)
     return np.concatenate([np.zeros(1), np.cumsum(np.hypot(step[:, 0], step[:, 1]))])
 
 
-def along(path: FloatArray, walked: FloatArray) -> FloatArray:
+def along(path: Float64s, walked: Float64s) -> Float64s:
     """The points [N, 2] of a path [P, 2] after the lengths `walked` [N]."""
     length = arc_length(path)
     return np.stack([np.interp(walked, length, path[:, axis]) for axis in (0, 1)], axis=1)
 
 
-def place(old: FloatArray, path: FloatArray, corners: FloatArray, length: float) -> FloatArray | None:
+def place(old: Float64s, path: Float64s, corners: Float64s, length: float) -> Float64s | None:
     """Positions [n, 2] on `path` for the steps that were at old [n, 2]; the first at its start, the last at `length`.
 
     In between the share of the way walked is as it was, but every corner (given by its length along the path) is hit by
@@ -33,7 +32,7 @@ def place(old: FloatArray, path: FloatArray, corners: FloatArray, length: float)
     return along(path, _hit(share * length, corners))
 
 
-def _hit(target: FloatArray, corners: FloatArray) -> FloatArray:
+def _hit(target: Float64s, corners: Float64s) -> Float64s:
     """`target` [n], not decreasing, warped so that every corner [m] is the value of one inner step."""
     if not len(corners):
         return target

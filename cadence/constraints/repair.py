@@ -11,16 +11,14 @@ from dataclasses import replace
 import numpy as np
 import shapely
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
+from cadence.arrays import Bools, Float64s
 from cadence.constraints.checker import absolute_array, segments_in_collision, states_in_collision
 from cadence.constraints.obstacles import Obstacles
 from cadence.constraints.placement import arc_length, place
 from cadence.constraints.roadmap import MAX_CORNERS, Growth, Request, Zone
 from cadence.constraints.spans import Case, Leg, Span, colliding_legs, diagnose, new_span, which_touch
-
-FloatArray = NDArray[np.float64]
 
 _STRETCH = 1.15
 """Steps may become this much longer before further neighbours share the detour."""
@@ -81,9 +79,7 @@ def _growths(obstacles: Obstacles, margin_m: float, dtype: torch.dtype) -> list[
     return [*growths, Growth(least, wide), Growth(0.1 * least, 0.001 * size, core_sides=256, outline_sides=24)]
 
 
-def _repair_legs(
-    track: FloatArray, repaired: FloatArray, pinned: NDArray[np.bool_], legs: list[Leg], zone: Zone, is_last: bool
-) -> list[Leg]:
+def _repair_legs(track: Float64s, repaired: Float64s, pinned: Bools, legs: list[Leg], zone: Zone, is_last: bool) -> list[Leg]:
     """Repair what can be repaired against one zone, into `repaired`; returns the legs that could not."""
     cases, failed = diagnose(track, pinned, legs, zone, is_last)
     cases, unrouted = _route(cases, zone)
@@ -142,9 +138,9 @@ def _widened(case: Case, steps: int) -> Case | None:
     return replace(case, spans=tuple(spans))
 
 
-def _paths(wanted: Sequence[tuple[Case, Span]], zone: Zone) -> list[FloatArray | None]:
+def _paths(wanted: Sequence[tuple[Case, Span]], zone: Zone) -> list[Float64s | None]:
     """The way round for each span, [P, 2] from start to end, or None."""
-    paths: list[FloatArray | None] = [None] * len(wanted)
+    paths: list[Float64s | None] = [None] * len(wanted)
     requests = {}
     for index, (case, span) in enumerate(wanted):
         if (request := _request(case, span, zone)) is not None:
@@ -181,7 +177,7 @@ def _request(case: Case, span: Span, zone: Zone) -> Request | None:
     return Request(point[0], point[1], corners, hop_cost, tuple(sorted(span.parts)))
 
 
-def _barrier(case: Case, span: Span, path: FloatArray, zone: Zone) -> FloatArray | None:
+def _barrier(case: Case, span: Span, path: Float64s, zone: Zone) -> Float64s | None:
     """A ray across the side of `path`, where most of the colliding steps are nearer to the other side; else None."""
     inside = case.point[span.first + 1 : span.last][case.is_bad[span.first + 1 : span.last]]
     chord = path[-1] - path[0]
@@ -201,7 +197,7 @@ def _barrier(case: Case, span: Span, path: FloatArray, zone: Zone) -> FloatArray
     return np.stack([middle, middle + side * reach * left])
 
 
-def _place_case(case: Case, is_strict: bool) -> FloatArray | None:
+def _place_case(case: Case, is_strict: bool) -> Float64s | None:
     """The positions [n, 2] of the leg with every span laid along its path; `is_strict` keeps to the spans' own steps."""
     point, end = case.point.copy(), len(case.point) - 1
     for index, span in enumerate(case.spans):
@@ -225,7 +221,7 @@ def _place_case(case: Case, is_strict: bool) -> FloatArray | None:
     return point
 
 
-def _stretch(point: FloatArray, span: Span, low: int, high: int) -> float:
+def _stretch(point: Float64s, span: Span, low: int, high: int) -> float:
     """How much longer the way low..high of a leg becomes by the detour of a span."""
     assert span.path is not None
     walked = arc_length(point)
@@ -234,7 +230,7 @@ def _stretch(point: FloatArray, span: Span, low: int, high: int) -> float:
     return float(new / old) if old > 0 else np.inf
 
 
-def _share(point: FloatArray, span: Span, floor: int, ceiling: int) -> tuple[int, int]:
+def _share(point: Float64s, span: Span, floor: int, ceiling: int) -> tuple[int, int]:
     """The fewest steps around a span, low..high, that share its detour so that none becomes much longer than it was."""
     low, high = span.first, span.last
     while (low > floor or high < ceiling) and _stretch(point, span, low, high) > _STRETCH:
@@ -243,7 +239,7 @@ def _share(point: FloatArray, span: Span, floor: int, ceiling: int) -> tuple[int
     return low, high
 
 
-def _lay(old: FloatArray, path: FloatArray, bends: slice, is_open: tuple[bool, bool]) -> FloatArray | None:
+def _lay(old: Float64s, path: Float64s, bends: slice, is_open: tuple[bool, bool]) -> Float64s | None:
     """Steps old [n, 2] laid along a path [P, 2], hitting the vertices `bends`; to its end or, if open, as far as before."""
     if len(old) == 1:
         return path[:1]
@@ -265,7 +261,7 @@ def _lay(old: FloatArray, path: FloatArray, bends: slice, is_open: tuple[bool, b
     return new
 
 
-def _pushed_out(case: Case, zone: Zone) -> FloatArray:
+def _pushed_out(case: Case, zone: Zone) -> Float64s:
     """The leg with every colliding step at the nearest free point: the most that can be done without a way round."""
     exits = zone.exits(case.point, case.region)
     return case.point if exits is None else np.where(case.is_bad[:, None], exits, case.point)

@@ -11,13 +11,11 @@ from typing import Any
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 
+from cadence.arrays import Bools, Float64s, Indices, Objects
 from cadence.constraints.obstacles import Obstacles
 from cadence.constraints.outlines import convex_bends, cross, grow_round, grow_sharp, loose_bends, polygon_parts
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.intp]
 _Parts = frozenset[int]
 """Components of the outline."""
 _Box = tuple[float, int, int]
@@ -49,12 +47,12 @@ class Request:
     parts are the components in the way; barrier, when given, is a segment [2, 2] that the route must not cross.
     """
 
-    start: FloatArray
-    end: FloatArray
+    start: Float64s
+    end: Float64s
     max_waypoints: int
     hop_cost_m: float
     parts: tuple[int, ...]
-    barrier: FloatArray | None = None
+    barrier: Float64s | None = None
 
 
 class Zone:
@@ -71,10 +69,10 @@ class Zone:
         # Largest first, so that the innermost of nested holes names the region.
         self.holes = _Index(np.array(sorted(holes, key=lambda hole: -hole.area), dtype=object))
         self._known_shapes: dict[tuple[int, int], Any] = {}
-        self._known_bends: dict[tuple[int, int], FloatArray] = {}
+        self._known_bends: dict[tuple[int, int], Float64s] = {}
         self._graphs: dict[_Parts | _Box, _Graph] = {}
 
-    def near(self, low: FloatArray, high: FloatArray) -> IntArray:
+    def near(self, low: Float64s, high: Float64s) -> Indices:
         """Indices of the boxes from low to high [N, 2] that meet the box of a component."""
         boxes = shapely.box(low[:, 0], low[:, 1], high[:, 0], high[:, 1])
         return np.unique(self.core.tree.query(boxes)[0])
@@ -84,19 +82,19 @@ class Zone:
         west, south, east, north = shapely.bounds(self.outline.shapes[part])
         return float(np.hypot(east - west, north - south))
 
-    def hits(self, start: FloatArray, end: FloatArray) -> IntArray:
+    def hits(self, start: Float64s, end: Float64s) -> Indices:
         """For segments from start to end [N, 2], a component of the outline in the way [N]; -1 where the core is clear."""
         found = np.full(len(start), -1)
         segment, part = self.core.touching(shapely.linestrings(np.stack([start, end], axis=1)))
         found[segment] = self._outline_of_core[part]
         return found
 
-    def blocks(self, start: FloatArray, end: FloatArray) -> NDArray[np.bool_]:
+    def blocks(self, start: Float64s, end: Float64s) -> Bools:
         """Whether the core touches segments from start to end [..., 2]; the quick form of `hits`."""
-        blocked: NDArray[np.bool_] = shapely.intersects(self._whole, shapely.linestrings(np.stack([start, end], axis=-2)))
+        blocked: Bools = shapely.intersects(self._whole, shapely.linestrings(np.stack([start, end], axis=-2)))
         return blocked
 
-    def regions(self, point: FloatArray) -> IntArray:
+    def regions(self, point: Float64s) -> Indices:
         """The region of free space of points [N, 2]: 0 outside everything, 1 + hole inside a hole, -1 in the core."""
         points = shapely.points(point)
         region = np.zeros(len(point), dtype=np.intp)
@@ -106,22 +104,22 @@ class Zone:
         region[self.core.touching(points)[0]] = -1
         return region
 
-    def exits(self, point: FloatArray, region: int) -> FloatArray | None:
+    def exits(self, point: Float64s, region: int) -> Float64s | None:
         """The points on the outline [N, 2] nearest to `point` [N, 2] in a region of free space; None where it has no border."""
         border = self._borders.get(region)
         if border is None:
             return None
         lines = shapely.shortest_line(border, shapely.points(point))
-        nearest: FloatArray = shapely.get_coordinates(lines).reshape(-1, 2, 2)[:, 0]
+        nearest: Float64s = shapely.get_coordinates(lines).reshape(-1, 2, 2)[:, 0]
         return nearest
 
-    def hull_holds(self, part: int, point: FloatArray) -> bool:
+    def hull_holds(self, part: int, point: Float64s) -> bool:
         """Whether all points [N, 2] lie in the convex hull of a component of the outline."""
         return bool(shapely.intersects_xy(self._hulls[part], point[:, 0], point[:, 1]).all())
 
-    def routes(self, requests: Sequence[Request]) -> list[FloatArray | None]:
+    def routes(self, requests: Sequence[Request]) -> list[Float64s | None]:
         """The shortest route of each request as its waypoints [m, 2] (start and end left out); None where there is none."""
-        found: list[FloatArray | None] = [None] * len(requests)
+        found: list[Float64s | None] = [None] * len(requests)
         for reach in _REACHES:
             groups: dict[_Parts | _Box, list[int]] = {}
             for index, request in enumerate(requests):
@@ -163,7 +161,7 @@ class Zone:
             self._graphs[key] = _Graph.build(self, bends, is_taut=not isinstance(key, frozenset))
         return self._graphs[key]
 
-    def _local_bends(self, box: "_Box") -> FloatArray:
+    def _local_bends(self, box: "_Box") -> Float64s:
         """Bends [V, 3, 2] in a box, from simplified outlines where there are too many; the middle ones if all else fails."""
         side, column, row = box
         middle = side * np.array([column, row])
@@ -176,10 +174,10 @@ class Zone:
             if len(bends) <= _MAX_BENDS:
                 return bends
         distance = np.abs(bends[:, 1] - middle).max(axis=1)
-        nearest: FloatArray = bends[np.sort(np.argsort(distance, kind="stable")[:_MAX_BENDS])]
+        nearest: Float64s = bends[np.sort(np.argsort(distance, kind="stable")[:_MAX_BENDS])]
         return nearest
 
-    def _bends(self, part: int, level: int) -> FloatArray:
+    def _bends(self, part: int, level: int) -> Float64s:
         """Bends of a component whose outline was simplified by clearance · 2^level (level 0: not at all)."""
         if (part, level) not in self._known_bends:
             clearance = self.growth.clearance_m
@@ -212,7 +210,7 @@ class Zone:
         return whole
 
     @cached_property
-    def _outline_of_core(self) -> IntArray:
+    def _outline_of_core(self) -> Indices:
         inner = shapely.point_on_surface(self.core.shapes)
         owner = np.zeros(len(inner), dtype=np.intp)
         index, part = self.outline.touching(inner)
@@ -220,8 +218,8 @@ class Zone:
         return owner
 
     @cached_property
-    def _hulls(self) -> NDArray[np.object_]:
-        hulls: NDArray[np.object_] = shapely.convex_hull(self.outline.shapes)
+    def _hulls(self) -> Objects:
+        hulls: Objects = shapely.convex_hull(self.outline.shapes)
         shapely.prepare(hulls)
         return hulls
 
@@ -241,12 +239,12 @@ class Zone:
 class _Index:
     """Prepared shapes with a search tree."""
 
-    def __init__(self, shapes: NDArray[np.object_]) -> None:
+    def __init__(self, shapes: Objects) -> None:
         self.shapes = shapes
         shapely.prepare(shapes)
         self.tree = shapely.STRtree(shapes)
 
-    def touching(self, geometry: NDArray[np.object_]) -> tuple[IntArray, IntArray]:
+    def touching(self, geometry: Objects) -> tuple[Indices, Indices]:
         """All pairs (index into geometry, index into shapes) that touch."""
         query, shape = self.tree.query(geometry)
         # Element by element with the prepared shape first: the tree's own predicate would prepare the many small queries.
@@ -258,16 +256,16 @@ class _Index:
 class _Graph:
     """Bends [V, 3, 2]: corners of routes between their neighbours on the outline; lengths [V, V] of free segments, else inf."""
 
-    bends: FloatArray
-    length: FloatArray
+    bends: Float64s
+    length: Float64s
 
     @property
-    def corners(self) -> FloatArray:
+    def corners(self) -> Float64s:
         """The corners themselves [V, 2]."""
         return self.bends[:, 1]
 
     @staticmethod
-    def build(zone: Zone, bends: FloatArray, is_taut: bool = False) -> "_Graph":
+    def build(zone: Zone, bends: Float64s, is_taut: bool = False) -> "_Graph":
         row, column = np.triu_indices(len(bends), k=1)
         if is_taut:
             useful = _touches_lightly(bends[row, 1], bends[column]) & _touches_lightly(bends[column, 1], bends[row])
@@ -276,7 +274,7 @@ class _Graph:
         length[row, column] = length[column, row] = _free_lengths(zone, bends[row, 1], bends[column, 1])
         return _Graph(bends, length)
 
-    def search(self, zone: Zone, requests: Sequence[Request]) -> list[FloatArray | None]:
+    def search(self, zone: Zone, requests: Sequence[Request]) -> list[Float64s | None]:
         """The shortest route of every request."""
         start, end = np.stack([r.start for r in requests]), np.stack([r.end for r in requests])
         ends = []
@@ -284,7 +282,7 @@ class _Graph:
             shape = (len(point), len(self.bends), 2)
             ends.append(_free_lengths(zone, np.broadcast_to(point[:, None], shape), np.broadcast_to(self.corners, shape)))
         direct = _free_lengths(zone, start, end)
-        routes: list[FloatArray | None] = [None] * len(requests)
+        routes: list[Float64s | None] = [None] * len(requests)
         free = [index for index, request in enumerate(requests) if request.barrier is None]
         rows = max(1, _CHUNK // max(1, len(self.corners) ** 2))
         for first in range(0, len(free), rows):
@@ -305,8 +303,8 @@ class _Graph:
         return routes
 
     def _shortest(
-        self, requests: Sequence[Request], best: FloatArray, first: FloatArray, last: FloatArray, between: FloatArray
-    ) -> list[FloatArray | None]:
+        self, requests: Sequence[Request], best: Float64s, first: Float64s, last: Float64s, between: Float64s
+    ) -> list[Float64s | None]:
         """Shortest paths by dynamic programming over the number of corners: best [R] holds the straight ways."""
         hop = np.array([r.hop_cost_m for r in requests])[:, None]
         allowed = np.array([r.max_waypoints for r in requests])
@@ -324,7 +322,7 @@ class _Graph:
             through = reach[:, :, None] + between
             came_from.append(through.argmin(axis=1))
             reach = through.min(axis=1) + hop
-        routes: list[FloatArray | None] = []
+        routes: list[Float64s | None] = []
         for index in row:
             chain = [int(corner[index])] if hops[index] else []
             for level in range(int(hops[index]) - 2, -1, -1):
@@ -333,32 +331,32 @@ class _Graph:
         return routes
 
 
-def _free_lengths(zone: Zone, start: FloatArray, end: FloatArray) -> FloatArray:
+def _free_lengths(zone: Zone, start: Float64s, end: Float64s) -> Float64s:
     """Lengths [...] of the segments from start to end [..., 2]; infinite where the core is in the way."""
     delta = end - start
-    length: FloatArray = np.hypot(delta[..., 0], delta[..., 1])
+    length: Float64s = np.hypot(delta[..., 0], delta[..., 1])
     return np.where(zone.blocks(start, end), np.inf, length)
 
 
-def _touches_lightly(point: FloatArray, bend: FloatArray) -> NDArray[np.bool_]:
+def _touches_lightly(point: Float64s, bend: Float64s) -> Bools:
     """Whether segments from point [..., 2] pass bends [..., 3, 2] with the outline on one side: only such can be shortest.
 
     Bends with NaN for neighbours belong to no outline and are always passed lightly.
     """
     corner = bend[..., 1, :]
     before, after = (cross(corner - point, bend[..., side, :] - corner) for side in (0, 2))
-    light: NDArray[np.bool_] = ~(before * after < 0)
+    light: Bools = ~(before * after < 0)
     return light
 
 
-def _crosses(start: FloatArray, end: FloatArray, barrier: FloatArray) -> NDArray[np.bool_]:
+def _crosses(start: Float64s, end: Float64s, barrier: Float64s) -> Bools:
     """Whether segments [..., 2] properly cross the barrier [2, 2]."""
     base, tip = barrier
     sides = cross(tip - base, start - base) * cross(tip - base, end - base)
     ends = cross(end - start, base - start) * cross(end - start, tip - start)
-    crosses: NDArray[np.bool_] = (sides < 0) & (ends < 0)
+    crosses: Bools = (sides < 0) & (ends < 0)
     return crosses
 
 
-def _joined(bends: Iterable[FloatArray]) -> FloatArray:
+def _joined(bends: Iterable[Float64s]) -> Float64s:
     return np.concatenate([np.full((0, 3, 2), np.nan), *bends])

@@ -6,11 +6,9 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cadence.arrays import Bools, Float64s, Indices
 from cadence.constraints.roadmap import Zone
-
-FloatArray = NDArray[np.float64]
 
 _RUN_UP = 0.4
 """Free steps before and after a collision that take part in the way round, as a share of the colliding ones."""
@@ -34,7 +32,7 @@ class Span:
     parts: frozenset[int]
     is_open_start: bool
     is_open_end: bool
-    path: FloatArray | None = None
+    path: Float64s | None = None
     """The way round [P, 2], from the position of `first` (or where it was moved to) to that of `last`."""
 
 
@@ -43,14 +41,14 @@ class Case:
     """A leg to repair: its positions [n, 2], which steps are bad [n], which of its ends are pinned, its region, its spans."""
 
     leg: Leg
-    point: FloatArray
-    is_bad: NDArray[np.bool_]
+    point: Float64s
+    is_bad: Bools
     is_pinned: tuple[bool, bool]
     region: int
     spans: tuple[Span, ...]
 
 
-def colliding_legs(track: FloatArray, pinned: NDArray[np.bool_], zone: Zone) -> list[Leg]:
+def colliding_legs(track: Float64s, pinned: Bools, zone: Zone) -> list[Leg]:
     """The legs of all tracks that touch the zone; tracks far from it, or with NaN, cost next to nothing."""
     whole = np.flatnonzero(np.isfinite(track).all(axis=(1, 2)))
     near = whole[zone.near(track[whole].min(axis=1), track[whole].max(axis=1))]
@@ -58,20 +56,18 @@ def colliding_legs(track: FloatArray, pinned: NDArray[np.bool_], zone: Zone) -> 
     return [Leg(row, low, high) for row in near[touches].tolist() for low, high in _cuts(pinned[row])]
 
 
-def _cuts(pinned: NDArray[np.bool_]) -> Iterator[tuple[int, int]]:
+def _cuts(pinned: Bools) -> Iterator[tuple[int, int]]:
     cuts = sorted({0, *np.flatnonzero(pinned).tolist(), len(pinned) - 1})
     yield from itertools.pairwise(cuts if len(cuts) > 1 else [0, 0])
 
 
-def _hits(point: FloatArray, zone: Zone) -> NDArray[np.intp]:
+def _hits(point: Float64s, zone: Zone) -> Indices:
     """The component in the way of every segment [R, T-1] (-1: none) of tracks [R, T, 2]; a single step is its own segment."""
     start, end = (point, point) if point.shape[1] == 1 else (point[:, :-1], point[:, 1:])
     return zone.hits(start.reshape(-1, 2), end.reshape(-1, 2)).reshape(start.shape[:2])
 
 
-def diagnose(
-    track: FloatArray, pinned: NDArray[np.bool_], legs: Sequence[Leg], zone: Zone, is_last: bool
-) -> tuple[list[Case], list[Case]]:
+def diagnose(track: Float64s, pinned: Bools, legs: Sequence[Leg], zone: Zone, is_last: bool) -> tuple[list[Case], list[Case]]:
     """The legs that collide, as cases that have a chance, and as cases that have none against this zone."""
     rows = np.unique([leg.row for leg in legs]).astype(np.intp)
     points = track[rows]
@@ -98,12 +94,12 @@ def diagnose(
     return cases, failed
 
 
-def _most_frequent(region: NDArray[np.intp]) -> int:
+def _most_frequent(region: Indices) -> int:
     free = region[region >= 0]
     return int(np.bincount(free).argmax()) if len(free) else 0
 
 
-def _spans(is_bad: NDArray[np.bool_], part: NDArray[np.intp], point: FloatArray, zone: Zone) -> tuple[Span, ...]:
+def _spans(is_bad: Bools, part: Indices, point: Float64s, zone: Zone) -> tuple[Span, ...]:
     """The runs of colliding segments; runs that are only parted by steps in a bay of the same component are one."""
     if len(is_bad) == 1:
         return (new_span(0, 0, frozenset(part[part >= 0].tolist()), is_bad),) if is_bad[0] else ()
@@ -120,7 +116,7 @@ def _spans(is_bad: NDArray[np.bool_], part: NDArray[np.intp], point: FloatArray,
     return tuple(_with_run_up(spans, is_bad))
 
 
-def _with_run_up(spans: Sequence[Span], is_bad: NDArray[np.bool_]) -> Iterator[Span]:
+def _with_run_up(spans: Sequence[Span], is_bad: Bools) -> Iterator[Span]:
     """The spans with some free steps before and after, so that a way round turns off before it stands at the wall."""
     for index, span in enumerate(spans):
         reach = math.ceil(_RUN_UP * (span.last - span.first))
@@ -129,12 +125,12 @@ def _with_run_up(spans: Sequence[Span], is_bad: NDArray[np.bool_]) -> Iterator[S
         yield new_span(max(floor, span.first - reach), min(ceiling, span.last + reach), span.parts, is_bad)
 
 
-def new_span(first: int, last: int, parts: frozenset[int], is_bad: NDArray[np.bool_]) -> Span:
+def new_span(first: int, last: int, parts: frozenset[int], is_bad: Bools) -> Span:
     """The span first..last without a path; its ends are open where they lie in an obstacle."""
     return Span(first, last, parts, is_open_start=bool(is_bad[first]), is_open_end=bool(is_bad[last]))
 
 
-def which_touch(points: Sequence[FloatArray | None], zone: Zone) -> list[bool]:
+def which_touch(points: Sequence[Float64s | None], zone: Zone) -> list[bool]:
     """Which tracks [n, 2] touch the zone; those that are None do."""
     found = [point for point in points if point is not None]
     if not found:

@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
+from cadence.arrays import Int64s
 from cadence.network.scene import Pieces, SceneInputs, SceneNetwork, SceneNetworkConfig, octaves
 from cadence.types import Context, Detections, WindowBatch
 from cadence.worlds.recordings import NUM_STEPS, Recordings
@@ -192,7 +192,7 @@ def _pieces(last: Tensor, last_age: Tensor, config: SceneConfig) -> Pieces:
     return Pieces(last, start, duration, duration * (config.unit_step_m / config.scale_m))
 
 
-def recorded_track(recordings: Recordings, row: NDArray[np.int64], episode: NDArray[np.int64], pieces: Pieces) -> Tensor:
+def recorded_track(recordings: Recordings, row: Int64s, episode: Int64s, pieces: Pieces) -> Tensor:
     """True positions [R, P + 1, 2] in metres at the ends of all pieces, for windows whose origins are the given rows [R].
 
     Straight between steps; after its episode's end (`episode` [R]) the target stays.

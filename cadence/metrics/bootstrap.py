@@ -3,7 +3,9 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+
+from cadence.arrays import Float64s
 
 _MAX_DRAWS = 4_000_000
 
@@ -56,7 +58,7 @@ def bootstrap_ratio(
     return Interval(value, low, high, int(is_valid.sum()), num_groups)
 
 
-def _percentiles(sums: NDArray[np.float64], rng: np.random.Generator, num_resamples: int, level: float) -> tuple[float, float]:
+def _percentiles(sums: Float64s, rng: np.random.Generator, num_resamples: int, level: float) -> tuple[float, float]:
     num_groups = len(sums)
     block = max(1, _MAX_DRAWS // num_groups)
     totals = [
@@ -68,6 +70,6 @@ def _percentiles(sums: NDArray[np.float64], rng: np.random.Generator, num_resamp
     return float(low), float(high)
 
 
-def _quotient(sums: NDArray[np.float64]) -> NDArray[np.float64]:
+def _quotient(sums: Float64s) -> Float64s:
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.asarray(sums[..., 0] / sums[..., 1])

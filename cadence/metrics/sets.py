@@ -2,11 +2,11 @@
 
 from dataclasses import dataclass
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 from torch import Tensor
+
+from cadence.arrays import Float64s
 
 
 @dataclass(frozen=True)
@@ -39,10 +39,10 @@ def ospa(estimated_m: Tensor, truth_m: Tensor, cutoff_m: float, order: float = 2
     return float(((cost + cutoff_m**order * (larger - smaller)) / larger) ** (1.0 / order))
 
 
-def _assigned_costs(estimated_m: Tensor, truth_m: Tensor, cutoff_m: float, order: float) -> NDArray[np.float64]:
+def _assigned_costs(estimated_m: Tensor, truth_m: Tensor, cutoff_m: float, order: float) -> Float64s:
     """Costs min(d, c)^p of the best assignment, one per pair of the smaller set."""
     distance = torch.cdist(
         estimated_m.double().reshape(-1, 2), truth_m.double().reshape(-1, 2), compute_mode="donot_use_mm_for_euclid_dist"
     )
-    cost: NDArray[np.float64] = distance.clamp(max=cutoff_m).pow(order).cpu().numpy()
+    cost: Float64s = distance.clamp(max=cutoff_m).pow(order).cpu().numpy()
     return cost[linear_sum_assignment(cost)]

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
+from cadence.arrays import Int64s
 from cadence.diffusion.sampler import even_angles, sample_ddim
 from cadence.diffusion.scene_frame import SceneConfig, recorded_track, scene_inputs, to_pieces
 from cadence.diffusion.scene_team import agent_rows, shared_detections
@@ -62,7 +62,7 @@ class SceneWindows:
 
 
 def scene_windows(
-    recordings: Recordings, rows: NDArray[np.int64], config: SceneConfig, told: Dropout, rng: np.random.Generator
+    recordings: Recordings, rows: Int64s, config: SceneConfig, told: Dropout, rng: np.random.Generator
 ) -> SceneWindows:
     """Windows whose origins are the given rows of the recordings; those without any detection are left out.
 

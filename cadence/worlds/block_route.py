@@ -13,11 +13,10 @@ import math
 from heapq import heappop, heappush
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
-from cadence.worlds.draws import Array, Indices
+from cadence.arrays import Bools, Float64s, Int64s
 
 _MOVES = [(1, 0), (0, 1), (-1, 0), (0, -1), (1, 1), (-1, 1), (-1, -1), (1, -1)]
 
@@ -25,16 +24,16 @@ _MOVES = [(1, 0), (0, 1), (-1, 0), (0, -1), (1, 1), (-1, 1), (-1, -1), (1, -1)]
 class BlockPlanner:
     """Ways over a square grid of prices [n, n]; blocks with prices at or below zero are closed. Answers are kept."""
 
-    def __init__(self, price: Array, factor: float, slack: float = 500.0) -> None:
+    def __init__(self, price: Float64s, factor: float, slack: float = 500.0) -> None:
         self.side, self.slack = len(price), slack
-        self.is_open: NDArray[np.bool_] = price.ravel() > 0
+        self.is_open: Bools = price.ravel() > 0
         cost = (price * factor).ravel().tolist()
         self._neighbours = [self._around(block, cost) for block in range(self.side**2)]
         self._backwards = self._reversed()
         self._fields: dict[int, tuple[list[float], list[float]]] = {}
-        self._known: dict[tuple[int, int], Indices] = {}
+        self._known: dict[tuple[int, int], Int64s] = {}
 
-    def plan(self, start: int, goal: int) -> Indices:
+    def plan(self, start: int, goal: int) -> Int64s:
         """The way from `start` to `goal` [W, 2], both included; blocks are numbered x * n + y.
 
         Raises `ValueError` where there is no way.

@@ -5,12 +5,12 @@ from dataclasses import dataclass
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 from scipy import sparse
 
+from cadence.arrays import Bools, Float64s
 from cadence.worlds.route import Agility, Craft, RouteField, RouteGrid, keep_out_for, smooth_path
 from cadence.worlds.sensors import SensorKind, square_search
-from cadence.worlds.terrain import Array, Clearance, Terrain, blocks_segment, smooth_field
+from cadence.worlds.terrain import Clearance, Terrain, blocks_segment, smooth_field
 
 BOAT = SensorKind("boat", 2300.0, 0.45, 20.0, math.radians(0.8), needs_sight=True)
 AIRCRAFT = SensorKind("aircraft", 3400.0, 0.6, 40.0, math.radians(0.7), needs_sight=False)
@@ -33,12 +33,12 @@ class Sea:
     clearance: Clearance
     grid: RouteGrid
     keep_out_m: float
-    base_cost: Array
+    base_cost: Float64s
     open_graph: sparse.csr_matrix
-    coves_m: Array
+    coves_m: Float64s
 
     @classmethod
-    def of(cls, terrain: Terrain, masts_m: Array, step_s: float) -> "Sea":
+    def of(cls, terrain: Terrain, masts_m: Float64s, step_s: float) -> "Sea":
         """Prepare a terrain; smugglers shun the masts [M, 2] and open edges, and know where the coves are."""
         clearance = Clearance.of(terrain, 100.0)
         keep_out = keep_out_for(clearance, SMUGGLER_AGILITY.max_speed_mps, step_s)
@@ -54,7 +54,7 @@ class Sea:
             coves = grid.is_free
         return cls(terrain, terrain.land(), clearance, grid, keep_out, cost, grid.graph(np.ones_like(cost)), centres[coves])
 
-    def route(self, fields: RouteField, position_m: Array) -> Array:
+    def route(self, fields: RouteField, position_m: Float64s) -> Float64s:
         """The smoothed way [P, 2] to a field's goal."""
         return smooth_path(fields.path_from(position_m), self.clearance, self.keep_out_m + 60.0)
 
@@ -65,7 +65,7 @@ class Smuggler:
 
     craft: Craft
     cruise_mps: float
-    goals_m: list[Array]
+    goals_m: list[Float64s]
     fields: RouteField
     mode: int = TRANSIT
     until_s: float = 0.0
@@ -123,8 +123,8 @@ def _resume(smuggler: Smuggler, sea: Sea) -> None:
 
 def steer_smuggler(
     smuggler: Smuggler,
-    sensors_m: Array,
-    is_active: NDArray[np.bool_],
+    sensors_m: Float64s,
+    is_active: Bools,
     kinds: list[SensorKind],
     sea: Sea,
     now_s: float,
@@ -165,7 +165,7 @@ def steer_smuggler(
     craft.follow(speed * (1.0 + smuggler.pace), step_s, wander)
 
 
-def _evade(smuggler: Smuggler, sensor_m: Array, kind: SensorKind, sea: Sea, now_s: float, rng: np.random.Generator) -> None:
+def _evade(smuggler: Smuggler, sensor_m: Float64s, kind: SensorKind, sea: Sea, now_s: float, rng: np.random.Generator) -> None:
     """React to a sensor that came near: hide behind land, creep, run by another way, or take no notice for a while."""
     choice = rng.random()
     smuggler.calm_from_s = now_s + rng.uniform(200.0, 600.0)
@@ -185,7 +185,7 @@ def _evade(smuggler: Smuggler, sensor_m: Array, kind: SensorKind, sea: Sea, now_
         smuggler.craft.take(sea.route(fields, smuggler.craft.position_m))
 
 
-def _shelter(position_m: Array, sensor_m: Array, sea: Sea, rng: np.random.Generator) -> Array | None:
+def _shelter(position_m: Float64s, sensor_m: Float64s, sea: Sea, rng: np.random.Generator) -> Float64s | None:
     """The nearest of some coves within 4 km that land hides from the sensor; None where there is none."""
     distance = np.hypot(*(sea.coves_m - position_m).T)
     near = np.flatnonzero(distance < 4000.0)
@@ -193,7 +193,7 @@ def _shelter(position_m: Array, sensor_m: Array, sea: Sea, rng: np.random.Genera
         return None
     some = rng.choice(near, min(len(near), 40), replace=False)
     hidden = some[blocks_segment(sea.land, sensor_m[None], sea.coves_m[some])]
-    place: Array | None = sea.coves_m[hidden[np.argmin(distance[hidden])]] if len(hidden) else None
+    place: Float64s | None = sea.coves_m[hidden[np.argmin(distance[hidden])]] if len(hidden) else None
     return place
 
 
@@ -211,7 +211,7 @@ def commission(sea: Sea, index: int, count: int, rng: np.random.Generator) -> Bo
     return Boat(craft, ring)
 
 
-def alert(boats: list[Boat], seen_m: Array, sea: Sea, now_s: float) -> None:
+def alert(boats: list[Boat], seen_m: Float64s, sea: Sea, now_s: float) -> None:
     """Send the nearest boat that is within 7 km and rested to where something was seen, for seven minutes at most."""
     ready = [boat for boat in boats if now_s < boat.chase_until_s or now_s >= boat.rest_until_s]
     if not ready:

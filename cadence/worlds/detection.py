@@ -7,23 +7,23 @@ DetectionObject]. A target that stands still cannot be detected.
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cadence.worlds.draws import Array, Draws
+from cadence.arrays import Bools, Float64s
+from cadence.worlds.draws import Draws
 
 REACH = 3.0
 """Ranges R at which the probability has fallen to zero."""
 
 
-def detection_probability(distance: Array, sure_range: Array) -> Array:
+def detection_probability(distance: Float64s, sure_range: Float64s) -> Float64s:
     """Probability that a sensor with range R = `sure_range` detects a target at `distance`; the arrays broadcast."""
     distance, sure_range = np.broadcast_arrays(distance, sure_range)
     ratio = np.divide(distance, sure_range, out=np.full(distance.shape, np.inf), where=sure_range > 0)
-    probability: Array = np.clip((REACH - ratio) / (REACH - 1.0), 0.0, 1.0)
+    probability: Float64s = np.clip((REACH - ratio) / (REACH - 1.0), 0.0, 1.0)
     return probability
 
 
-def detect(draws: Draws, stream: int, step: int, sensors: Array, target: Array, sure_range: Array) -> NDArray[np.bool_]:
+def detect(draws: Draws, stream: int, step: int, sensors: Float64s, target: Float64s, sure_range: Float64s) -> Bools:
     """Which of the sensors detect the target of their episode at this step: [B, S].
 
     sensors [B, S, 2] or, the same in all episodes, [S, 2]; target [B, 2]; sure_range [B, S], R of every sensor (0: off).

@@ -7,8 +7,7 @@ OOPSLA 2014), applied once a coordinate of the address.
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
+from cadence.arrays import Float64s, Int64s
 
 _GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 _FIRST = np.uint64(0xBF58476D1CE4E5B9)
@@ -39,13 +38,13 @@ class Draws:
     def __len__(self) -> int:
         return len(self._keys)
 
-    def uniform(self, rows: Indices, stream: int, step: int, index: ArrayLike = 0) -> Array:
+    def uniform(self, rows: Int64s, stream: int, step: int, index: ArrayLike = 0) -> Float64s:
         """Numbers in [0, 1) for the batch's `rows` [N]; `index` is a number or one a row."""
         word = _fold(_fold(_fold(self._keys[rows], stream), step), index)
-        share: Array = (word >> np.uint64(11)).astype(np.float64) * 2.0**-53
+        share: Float64s = (word >> np.uint64(11)).astype(np.float64) * 2.0**-53
         return share
 
-    def point(self, rows: Indices, stream: int, step: int, index: ArrayLike = 0) -> Array:
+    def point(self, rows: Int64s, stream: int, step: int, index: ArrayLike = 0) -> Float64s:
         """Points [N, 2] of the unit square."""
         index = np.asarray(index, dtype=np.int64) * 2
         x, y = self.uniform(rows, stream, step, index), self.uniform(rows, stream, step, index + 1)

@@ -5,7 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from cadence.worlds.terrain import Array, Terrain
+from cadence.arrays import Bools, Float64s, Int64s
+from cadence.worlds.terrain import Terrain
 
 
 @dataclass(frozen=True, eq=False)
@@ -18,11 +19,11 @@ class SensorReports:
     covariance_m2 [N, 2, 2] covariance of its noise
     """
 
-    step: NDArray[np.int64]
-    agent: NDArray[np.int64]
-    sensor: NDArray[np.int64]
-    position_m: Array
-    covariance_m2: Array
+    step: Int64s
+    agent: Int64s
+    sensor: Int64s
+    position_m: Float64s
+    covariance_m2: Float64s
 
     def __len__(self) -> int:
         return len(self.step)
@@ -41,15 +42,15 @@ class Episode:
     """
 
     world: str
-    time_s: Array
+    time_s: Float64s
     agent_ids: tuple[str, ...]
-    truth_m: Array
+    truth_m: Float64s
     mode_names: tuple[str, ...]
     mode: NDArray[np.int8]
-    goals_m: tuple[Array, ...]
+    goals_m: tuple[Float64s, ...]
     sensor_ids: tuple[str, ...]
-    sensors_m: Array
-    is_active: NDArray[np.bool_]
+    sensors_m: Float64s
+    is_active: Bools
     detections: SensorReports
     terrain: Terrain
 
@@ -65,7 +66,7 @@ class Episode:
             if getattr(self, name).shape != want:
                 raise ValueError(f"Episode.{name} has shape {getattr(self, name).shape}, expected {want}")
 
-    def is_detected(self) -> NDArray[np.bool_]:
+    def is_detected(self) -> Bools:
         """Steps of each agent [A, T] that hold at least one detection."""
         seen = np.zeros(self.mode.shape, dtype=bool)
         is_caused = self.detections.agent >= 0
@@ -73,8 +74,8 @@ class Episode:
         return seen
 
 
-def gaps_s(is_detected: NDArray[np.bool_], step_s: float) -> Array:
+def gaps_s(is_detected: Bools, step_s: float) -> Float64s:
     """Lengths of the gaps between consecutive detections of one agent [T], where they are longer than one step."""
     between = np.diff(np.flatnonzero(is_detected))
-    lengths: Array = between[between > 1] * step_s
+    lengths: Float64s = between[between > 1] * step_s
     return lengths

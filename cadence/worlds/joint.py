@@ -4,10 +4,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cadence.worlds.draws import Array
-from cadence.worlds.recordings import Int64s, Recordings
+from cadence.arrays import Bools, Float32s, Float64s, Floats, Int64s
+from cadence.worlds.recordings import Recordings
 
 MEETING_RADIUS_M = 600.0
 """Agents that are so near to a site at one step are there together: four steps' way, a fifth of the distance of sites."""
@@ -25,9 +24,9 @@ class JointRecordings:
     """
 
     recordings: Recordings
-    is_meeting: NDArray[np.bool_]
-    goal_m: Array
-    site_m: Array
+    is_meeting: Bools
+    goal_m: Float64s
+    site_m: Float64s
     left_site_step: Int64s
 
     def __post_init__(self) -> None:
@@ -52,7 +51,7 @@ class JointRecordings:
         """Steps of every episode [E]."""
         return self.recordings.length[:: self.num_agents]
 
-    def track_m(self, episode: int) -> NDArray[np.float32]:
+    def track_m(self, episode: int) -> Float32s:
         """Where the agents of one episode were [A, T, 2]."""
         first, end = self.recordings.offset[[episode * self.num_agents, (episode + 1) * self.num_agents]]
         return self.recordings.position_m[first:end].reshape(self.num_agents, -1, 2)
@@ -69,7 +68,7 @@ class JointRecordings:
         )
 
 
-def meets(position_m: NDArray[np.floating], sites_m: Array, radius_m: float = MEETING_RADIUS_M) -> NDArray[np.bool_]:
+def meets(position_m: Floats, sites_m: Float64s, radius_m: float = MEETING_RADIUS_M) -> Bools:
     """Whether [...] the agents of tracks [..., A, T, 2] are all within `radius_m` of one of the sites [S, 2] at some step.
 
     The same rule for truth and for samples. Agents that are NaN at a step are not asked; two at least must be there.

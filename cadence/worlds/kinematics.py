@@ -8,9 +8,8 @@ particular data set.
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-Floats = npt.NDArray[np.float64]
+from cadence.arrays import Bools, Float64s, Int64s
 
 SUBSTEPS = 4
 """Samples per step: detections lie between the steps of the window grid."""
@@ -37,8 +36,8 @@ class Scenario:
     sigma          standard deviation of a detection, an axis
     """
 
-    mode_share: Floats
-    mode_duration: Floats
+    mode_share: Float64s
+    mode_duration: Float64s
     turn_rate: float
     turn_noise: float
     turn_memory: float
@@ -55,8 +54,8 @@ class Scenario:
 class SyntheticTracks:
     """Tracks of one scenario: positions [N, L * SUBSTEPS + 1, 2] and where they were detected (bool [N, L * SUBSTEPS + 1])."""
 
-    position: Floats
-    is_detected: npt.NDArray[np.bool_]
+    position: Float64s
+    is_detected: Bools
     scenario: Scenario
 
 
@@ -97,7 +96,7 @@ def simulate_tracks(scenario: Scenario, num_tracks: int, num_steps: int, rng: np
     return SyntheticTracks(position, _detect(scenario, num_tracks, num_steps, rng), scenario)
 
 
-def _log_uniform(rng: np.random.Generator, low: float | Floats, high: float | Floats) -> Floats:
+def _log_uniform(rng: np.random.Generator, low: float | Float64s, high: float | Float64s) -> Float64s:
     return np.exp(rng.uniform(np.log(low), np.log(high)))
 
 
@@ -106,16 +105,16 @@ class _Targets:
     """Moving state of all targets of a scenario [N, ...]."""
 
     scenario: Scenario
-    position: Floats
-    heading: Floats
-    turn: Floats
-    speed: Floats
-    cruise: Floats
-    mode: npt.NDArray[np.int64]
-    time_left: Floats
-    turn_command: Floats
-    speed_command: Floats
-    goal: Floats
+    position: Float64s
+    heading: Float64s
+    turn: Float64s
+    speed: Float64s
+    cruise: Float64s
+    mode: Int64s
+    time_left: Float64s
+    turn_command: Float64s
+    speed_command: Float64s
+    goal: Float64s
 
     @classmethod
     def start(cls, scenario: Scenario, num_tracks: int, rng: np.random.Generator) -> "_Targets":
@@ -142,7 +141,7 @@ class _Targets:
         step = (self.speed * dt)[:, None] * np.stack([np.cos(self.heading), np.sin(self.heading)], axis=-1)
         self.position += step
 
-    def _steer(self, goal: Floats) -> Floats:
+    def _steer(self, goal: Float64s) -> Float64s:
         """Turn rate towards a point, at most three times the scenario's."""
         offset = goal - self.position
         error = np.arctan2(offset[:, 1], offset[:, 0]) - self.heading
@@ -150,7 +149,7 @@ class _Targets:
         limit = max(2.0 * self.scenario.turn_rate, 2.0 / self.scenario.arena_radius)
         return np.clip(error, -limit, limit)
 
-    def _enter_modes(self, which: npt.NDArray[np.int64], rng: np.random.Generator) -> None:
+    def _enter_modes(self, which: Int64s, rng: np.random.Generator) -> None:
         if len(which) == 0:
             return
         s, n = self.scenario, len(which)
@@ -167,7 +166,7 @@ class _Targets:
         self.goal[which] = centre + reach * rng.normal(0.0, 0.7, (n, 2))
 
 
-def _detect(scenario: Scenario, num_tracks: int, num_steps: int, rng: np.random.Generator) -> npt.NDArray[np.bool_]:
+def _detect(scenario: Scenario, num_tracks: int, num_steps: int, rng: np.random.Generator) -> Bools:
     """Alternating exponential gaps and bursts; within a burst a detection every interval, at least one a burst."""
     length = num_steps * SUBSTEPS + 1
     detected = np.zeros((num_tracks, length), dtype=bool)

@@ -22,10 +22,10 @@ from typing import Literal
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 
+from cadence.arrays import Bools, Float32s, Float64s, Int64s
 from cadence.worlds.detection import detect
-from cadence.worlds.draws import Array, Draws, Indices
+from cadence.worlds.draws import Draws
 from cadence.worlds.episode import Episode, SensorReports
 from cadence.worlds.ocean import CELL, SIZE, Ocean, eastern_pacific
 from cadence.worlds.pursuit import AIRPLANE, VESSEL, MoverKind, Pursuit, is_working
@@ -88,23 +88,23 @@ class _Routes:
     rendezvous
     """
 
-    position: Array
-    speed: Array
-    last: Indices
-    met: Indices
+    position: Float64s
+    speed: Float64s
+    last: Int64s
+    met: Int64s
 
 
 @dataclass(frozen=True, eq=False)
 class _Batch:
     """B episodes in lockstep: route [B], hideouts [B, 2], last step [B], movers [T, B, M, 2] km, hits [T, B, M]."""
 
-    route: Indices
-    last: Indices
-    movers: NDArray[np.float32]
-    hit: NDArray[np.bool_]
+    route: Int64s
+    last: Int64s
+    movers: Float32s
+    hit: Bools
 
 
-def _sail(points: Array) -> Array:
+def _sail(points: Float64s) -> Float64s:
     """Positions [T, 2] along way-points, 7.5 km a step, the last step to each of them shorter; without the first point."""
     legs = []
     for begin, end in itertools.pairwise(points):
@@ -133,7 +133,7 @@ def _routes(ocean: Ocean) -> _Routes:
     return _Routes(position, speed, np.array([len(path) - 1 for path in paths]), np.array(met))
 
 
-def _choose_routes(draws: Draws) -> Indices:
+def _choose_routes(draws: Draws) -> Int64s:
     """A rendezvous and the nearer of two different hideouts for every episode [B]."""
     rows = np.arange(len(draws))
     share = [draws.uniform(rows, _STREAM_ROUTE, 0, choice) for choice in range(3)]
@@ -145,7 +145,7 @@ def _choose_routes(draws: Draws) -> Indices:
     return rendezvous * len(HIDEOUTS) + nearer
 
 
-def _run(config: NarcoConfig, seed: int, indices: Indices) -> _Batch:
+def _run(config: NarcoConfig, seed: int, indices: Int64s) -> _Batch:
     """Simulate the episodes `indices` [B] of `seed` together; what happens in one depends on no other."""
     ocean, kinds, draws = eastern_pacific(), config.kinds, Draws(seed, indices)
     routes, route = _routes(ocean), _choose_routes(draws)
@@ -173,7 +173,7 @@ def _run(config: NarcoConfig, seed: int, indices: Indices) -> _Batch:
     return _Batch(route, last, movers, hit)
 
 
-def simulate_narco_batch(config: NarcoConfig, seed: int, indices: NDArray[np.int64]) -> Recordings:
+def simulate_narco_batch(config: NarcoConfig, seed: int, indices: Int64s) -> Recordings:
     """The episodes `indices` [E] of `seed`; each depends on nothing but its index, the seed and the settings."""
     indices = np.asarray(indices, dtype=np.int64)
     batch, routes = _run(config, seed, indices), _routes(eastern_pacific())

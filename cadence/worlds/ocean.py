@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 from scipy import ndimage, sparse
 from scipy.sparse import csgraph
 
-from cadence.worlds.draws import Array, Indices
-from cadence.worlds.pursuit import Mask
+from cadence.arrays import Bools, Float64s, Int64s
 
 COLUMNS, ROWS = 71, 32
 SIZE = np.array([COLUMNS * 111.32 * math.cos(math.radians(4.0)), ROWS * 110.574])
@@ -51,17 +50,17 @@ _GALAPAGOS = np.array([[-91.4, -1.0], [-90.2, -1.0], [-90.2, 0.1], [-91.4, 0.1]]
 """Longitude and latitude in degrees."""
 
 
-def _land() -> NDArray[np.bool_]:
+def _land() -> Bools:
     """Which cells [COLUMNS, ROWS] are land: their middles are, or no way over water leads there."""
     column, row = np.meshgrid(np.arange(COLUMNS), np.arange(ROWS), indexing="ij")
     ground = shapely.union_all([shapely.Polygon(_COAST), shapely.Polygon(_GALAPAGOS)])
     is_land = shapely.contains_xy(ground, column + 0.5 + _WEST, row + 0.5 + _SOUTH)
     label, _ = ndimage.label(~is_land)
-    open_sea: NDArray[np.bool_] = label == np.argmax(np.bincount(label.ravel())[1:]) + 1
+    open_sea: Bools = label == np.argmax(np.bincount(label.ravel())[1:]) + 1
     return ~open_sea
 
 
-def _waves(is_land: NDArray[np.bool_]) -> Array:
+def _waves(is_land: Bools) -> Float64s:
     """Wave heights [NUM_CHARTS, COLUMNS, ROWS] in metres; 0 on land."""
     rng = np.random.default_rng(_CHART_SEED)
     x, y = np.meshgrid((np.arange(COLUMNS) + 0.5) * CELL[0], (np.arange(ROWS) + 0.5) * CELL[1], indexing="ij")
@@ -77,7 +76,7 @@ def _waves(is_land: NDArray[np.bool_]) -> Array:
     for wave, angle, start in zip(length, course, phase, strict=True):
         along = x * np.cos(angle) + y * np.sin(angle)
         field += np.cos(2 * np.pi * (along - 34.0 * hours[:, None, None]) / wave + start)
-    height: Array = np.where(is_land, 0.0, mean * np.exp(0.22 * field * np.sqrt(2.0 / num_swells)))
+    height: Float64s = np.where(is_land, 0.0, mean * np.exp(0.22 * field * np.sqrt(2.0 / num_swells)))
     return height
 
 
@@ -89,62 +88,62 @@ class Ocean:
     wave     [NUM_CHARTS, COLUMNS, ROWS] significant wave height in metres
     """
 
-    is_land: NDArray[np.bool_]
-    wave: Array
-    size: Array = field(default_factory=SIZE.copy)
+    is_land: Bools
+    wave: Float64s
+    size: Float64s = field(default_factory=SIZE.copy)
 
-    def cell_of(self, point: Array) -> Indices:
+    def cell_of(self, point: Float64s) -> Int64s:
         """Column and row of the cell that holds each point [..., 2]."""
         share = point / CELL
         near = np.rint(share)
         cell = np.where(np.abs(share - near) < _SNAP, near, np.floor(share)).astype(np.int64)
         return np.clip(cell, 0, [COLUMNS - 1, ROWS - 1])
 
-    def coverage(self, point: Array, step: int) -> Array:
+    def coverage(self, point: Float64s, step: int) -> Float64s:
         """The coverage c [...] at points [..., 2]."""
         cell = self.cell_of(point)
-        height: Array = self.wave[min(step // STEPS_PER_CHART, NUM_CHARTS - 1), cell[..., 0], cell[..., 1]]
+        height: Float64s = self.wave[min(step // STEPS_PER_CHART, NUM_CHARTS - 1), cell[..., 0], cell[..., 1]]
         return height / 15.0
 
-    def is_outside(self, point: Array) -> Mask:
+    def is_outside(self, point: Float64s) -> Bools:
         """Off the map, or within a kilometre of its edge."""
-        outside: Mask = np.any((point < 1.0) | (point > self.size - 1.0), axis=-1)
+        outside: Bools = np.any((point < 1.0) | (point > self.size - 1.0), axis=-1)
         return outside
 
-    def is_closed(self, point: Array) -> Mask:
+    def is_closed(self, point: Float64s) -> Bools:
         """On land."""
         cell = self.cell_of(point)
-        closed: Mask = self.is_land[cell[..., 0], cell[..., 1]]
+        closed: Bools = self.is_land[cell[..., 0], cell[..., 1]]
         return closed
 
-    def ends_spiral(self, point: Array) -> Mask:
+    def ends_spiral(self, point: Float64s) -> Bools:
         """Off the map or on land."""
         return self.is_outside(point) | self.is_closed(point)
 
-    def ends_line(self, point: Array, ahead: Array, speed: Array) -> Mask:
+    def ends_line(self, point: Float64s, ahead: Float64s, speed: Float64s) -> Bools:
         """Within a full step of the edge, or before land."""
-        edge: Mask = np.any((point <= speed[:, None]) | (point >= self.size - speed[:, None]), axis=-1)
+        edge: Bools = np.any((point <= speed[:, None]) | (point >= self.size - speed[:, None]), axis=-1)
         return np.logical_or(edge, self.is_closed(ahead))
 
-    def settle(self, point: Array, heading: Array, otherwise: Array) -> Array:
+    def settle(self, point: Float64s, heading: Float64s, otherwise: Float64s) -> Float64s:
         """A point on land moves on along its heading in steps of 10 km, 2000 km at most; failing that, `otherwise`."""
         settled = point.copy()
         dry = np.flatnonzero(self.is_closed(point))
         if len(dry):
             trial = point[dry, None] + heading[dry, None] * (10.0 * np.arange(1, 201))[:, None]
-            fits: Mask = np.logical_not(self.ends_spiral(trial))
+            fits: Bools = np.logical_not(self.ends_spiral(trial))
             first = trial[np.arange(len(dry)), fits.argmax(axis=1)]
             settled[dry] = np.where(np.any(fits, axis=1, keepdims=True), first, otherwise[dry])
         return settled
 
-    def aim(self, position: Array, goal: Array) -> Array:
+    def aim(self, position: Float64s, goal: Float64s) -> Float64s:
         """The goal where it lies in the same cell, else the corner of the next cell on the searchers' way to it."""
         here, there = self._node(self.cell_of(position)), self._node(self.cell_of(goal))
         onward = self.next_cell[there, here].astype(np.int64)
         corner = np.stack([onward // ROWS, onward % ROWS], axis=-1) * CELL
         return np.where(((here == there) | (onward < 0))[:, None], goal, corner)
 
-    def move(self, position: Array, direction: Array, speed: Array) -> Array:
+    def move(self, position: Float64s, direction: Float64s, speed: Float64s) -> Float64s:
         """One step; nobody goes on land or off the map."""
         moved = position + direction * speed[:, None]
         moved = np.where(self.is_outside(moved)[:, None], np.clip(moved, 0.0, self.size - 1.0), moved)
@@ -168,7 +167,7 @@ class Ocean:
         arcs = (np.concatenate(costs), (np.concatenate(begins), np.concatenate(ends)))
         return sparse.csr_matrix(arcs, shape=(COLUMNS * ROWS, COLUMNS * ROWS))
 
-    def way(self, start: Array, goal: Array, wave_cost: float) -> Array:
+    def way(self, start: Float64s, goal: Float64s, wave_cost: float) -> Float64s:
         """Way-points [P, 2] of the cheapest way between two points: start, corners of the cells between, goal."""
         first, last = (int(self._node(self.cell_of(point))) for point in (start, goal))
         before = csgraph.dijkstra(self.graph(wave_cost), indices=np.array([first]), return_predecessors=True)[1][0]
@@ -191,14 +190,14 @@ class Ocean:
         onward[water] = np.maximum(before, -1)
         return onward
 
-    def _is_water(self, column: Indices, row: Indices) -> Mask:
-        inside: Mask = (column >= 0) & (column < COLUMNS) & (row >= 0) & (row < ROWS)
-        wet: Mask = inside & ~self.is_land[np.clip(column, 0, COLUMNS - 1), np.clip(row, 0, ROWS - 1)]
+    def _is_water(self, column: Int64s, row: Int64s) -> Bools:
+        inside: Bools = (column >= 0) & (column < COLUMNS) & (row >= 0) & (row < ROWS)
+        wet: Bools = inside & ~self.is_land[np.clip(column, 0, COLUMNS - 1), np.clip(row, 0, ROWS - 1)]
         return wet
 
     @staticmethod
-    def _node(cell: Indices) -> Indices:
-        node: Indices = cell[..., 0] * ROWS + cell[..., 1]
+    def _node(cell: Int64s) -> Int64s:
+        node: Int64s = cell[..., 0] * ROWS + cell[..., 1]
         return node
 
 

@@ -8,8 +8,8 @@ long gaps between them, and where a smuggler is in a gap depends on the land and
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cadence.arrays import Bools, Float64s, Int64s
 from cadence.worlds.crews import (
     AIRCRAFT,
     BOAT,
@@ -25,7 +25,7 @@ from cadence.worlds.crews import (
 )
 from cadence.worlds.episode import Episode, SensorReports
 from cadence.worlds.sensors import SensorKind, Sortie, draw_noise, measurement_covariance, sweep_track, swerling_probability
-from cadence.worlds.terrain import Array, Terrain, blocks_segment, random_archipelago
+from cadence.worlds.terrain import Terrain, blocks_segment, random_archipelago
 
 # Mean share of steps with a detection by the factor on all detection ranges; 120 episodes of the defaults each.
 _RANGE_FACTORS = (0.5, 0.7, 0.85, 1.0, 1.2, 1.5, 2.0, 3.0)
@@ -82,11 +82,11 @@ class PatrolConfig:
 class _Log:
     """Detections while they are collected."""
 
-    step: list[NDArray[np.int64]] = field(default_factory=list)
-    agent: list[NDArray[np.int64]] = field(default_factory=list)
-    sensor: list[NDArray[np.int64]] = field(default_factory=list)
-    position_m: list[Array] = field(default_factory=list)
-    covariance_m2: list[Array] = field(default_factory=list)
+    step: list[Int64s] = field(default_factory=list)
+    agent: list[Int64s] = field(default_factory=list)
+    sensor: list[Int64s] = field(default_factory=list)
+    position_m: list[Float64s] = field(default_factory=list)
+    covariance_m2: list[Float64s] = field(default_factory=list)
 
     def close(self) -> SensorReports:
         """All of it as arrays."""
@@ -112,8 +112,8 @@ class _Eyes:
         self.land = sea.land
 
     def look(
-        self, targets_m: Array, speed_mps: Array, sensors_m: Array, is_active: NDArray[np.bool_], rng: np.random.Generator
-    ) -> tuple[NDArray[np.int64], NDArray[np.int64], Array, Array]:
+        self, targets_m: Float64s, speed_mps: Float64s, sensors_m: Float64s, is_active: Bools, rng: np.random.Generator
+    ) -> tuple[Int64s, Int64s, Float64s, Float64s]:
         """Agent [N], sensor [N], measured position [N, 2] and covariance [N, 2, 2] of one step's detections.
 
         targets_m [A, 2], speed_mps [A], sensors_m [S, 2], is_active [S]. A fast boat shows a wake: the range grows from 0.6
@@ -137,7 +137,7 @@ def simulate_patrol(config: PatrolConfig, rng: np.random.Generator) -> Episode:
     terrain = random_archipelago(rng, config.side_m)
     masts = _mast_sites(terrain, config.num_masts, rng)
     sea = Sea.of(terrain, masts, config.step_s)
-    time_s: Array = config.step_s * np.arange(round(config.duration_s / config.step_s) + 1, dtype=np.float64)
+    time_s: Float64s = config.step_s * np.arange(round(config.duration_s / config.step_s) + 1, dtype=np.float64)
     smugglers = [launch(sea, rng) for _ in range(config.num_agents)]
     boats = [commission(sea, index, config.num_boats, rng) for index in range(config.num_boats)]
     sweeps = [sweep_track(rng, time_s, config.side_m, Sortie()) for _ in range(config.num_aircraft)]
@@ -191,7 +191,7 @@ def _number(names: list[str]) -> tuple[str, ...]:
     return tuple(f"{name}_{names[: index + 1].count(name)}" for index, name in enumerate(names))
 
 
-def _mast_sites(terrain: Terrain, count: int, rng: np.random.Generator) -> Array:
+def _mast_sites(terrain: Terrain, count: int, rng: np.random.Generator) -> Float64s:
     """Places [M, 2] just off the shore of the larger islands; the island behind a mast hides what is on its other side."""
     islands = terrain.polygons_m[: max(count, 5)]
     if not islands:

@@ -5,10 +5,8 @@ the common C implementations: a terrain made from it is compared with theirs cel
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-Array32 = NDArray[np.float32]
+from cadence.arrays import Float32s, Float64s, Int64s
 
 _PERMUTATION = """
 151 160 137 91 90 15 131 13 201 95 96 53 194 233 7 225 140 36 103 30 69 142 8 99 37 240 21 10 23 190 6 148 247 120 234 75 0
@@ -27,7 +25,7 @@ _GRADIENTS = np.array(
 ).reshape(16, 2)
 
 
-def octave(x: Array32, y: Array32, period: np.float32, base: int) -> Array32:
+def octave(x: Float32s, y: Float32s, period: np.float32, base: int) -> Float32s:
     """One octave [X, Y] of noise in about -1 ... 1 at the products of `x` [X] and `y` [Y], repeating after `period`.
 
     `base` shifts the lattice: other numbers give other landscapes.
@@ -46,13 +44,13 @@ def octave(x: Array32, y: Array32, period: np.float32, base: int) -> Array32:
         corners.append((u - np.float32(du)) * gradient[..., 0] + (v - np.float32(dv)) * gradient[..., 1])
     low = corners[0] + blend_x[:, None] * (corners[1] - corners[0])
     high = corners[2] + blend_x[:, None] * (corners[3] - corners[2])
-    noise: Array32 = low + blend_y[None, :] * (high - low)
+    noise: Float32s = low + blend_y[None, :] * (high - low)
     return noise
 
 
 def fractal(
-    x: Array32, y: Array32, *, octaves: int, persistence: float, lacunarity: float, period: float, base: int
-) -> Array32:
+    x: Float32s, y: Float32s, *, octaves: int, persistence: float, lacunarity: float, period: float, base: int
+) -> Float32s:
     """Octaves summed: each has `persistence` times the height and `lacunarity` times the frequency of the one before.
 
     Returns [X, Y] for `x` [X] and `y` [Y], divided by the sum of the heights.
@@ -67,7 +65,7 @@ def fractal(
     return total / heights
 
 
-def enlarge_twice(image: Array) -> Array:
+def enlarge_twice(image: Float64s) -> Float64s:
     """The image [X, Y] at twice the resolution [2X, 2Y], bilinear between the middles of its cells, flat beyond the last."""
     for axis in (1, 0):
         image = np.swapaxes(image, 0, axis)
@@ -80,11 +78,11 @@ def enlarge_twice(image: Array) -> Array:
     return image
 
 
-def _axis(x: Array32, period: np.float32, base: int) -> tuple[NDArray[np.int64], NDArray[np.int64], Array32, Array32]:
+def _axis(x: Float32s, period: np.float32, base: int) -> tuple[Int64s, Int64s, Float32s, Float32s]:
     """Lattice line below, the one above, place between them and its smooth blend, of coordinates `x` [X]."""
     cell = np.floor(np.fmod(x, period)).astype(np.int64)
     above = np.fmod(cell + 1, period).astype(np.int64)
-    place: Array32 = (x - np.floor(x)).astype(np.float32)
+    place: Float32s = (x - np.floor(x)).astype(np.float32)
     six, fifteen, ten = np.float32(6), np.float32(15), np.float32(10)
     blend = place * place * place * (place * (place * six - fifteen) + ten)
     return (cell & 255) + base, (above & 255) + base, place, blend.astype(np.float32)

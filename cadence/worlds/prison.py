@@ -21,8 +21,9 @@ from typing import Literal, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from cadence.arrays import Bools, Float64s, Int64s
 from cadence.worlds.detection import detect
-from cadence.worlds.draws import Array, Draws
+from cadence.worlds.draws import Draws
 from cadence.worlds.episode import Episode, SensorReports
 from cadence.worlds.prison_fugitive import MODE_NAMES, Fugitives, Sight, distance_between, stride
 from cadence.worlds.prison_map import (
@@ -34,7 +35,6 @@ from cadence.worlds.prison_map import (
     SEEN_CAMERAS,
     SIDE,
     UNKNOWN_SITES,
-    Bools,
     prison_map,
 )
 from cadence.worlds.prison_search import Search
@@ -98,10 +98,10 @@ class _Places:
     Of the cameras the fugitive knows the first `num_known`; among them the one at the start and the one at the refuge.
     """
 
-    start: Array
-    goal: Array
-    refuge: Array
-    camera: Array
+    start: Float64s
+    goal: Float64s
+    refuge: Float64s
+    camera: Float64s
     num_known: int
 
     @classmethod
@@ -128,14 +128,14 @@ class _Batch:
     """
 
     places: _Places
-    last: NDArray[np.int64]
+    last: Int64s
     target: NDArray[np.int16]
     mode: NDArray[np.int8]
     movers: NDArray[np.int16]
-    hits: NDArray[np.int64]
+    hits: Int64s
 
 
-def _run(config: PrisonConfig, seed: int, numbers: NDArray[np.int64]) -> _Batch:
+def _run(config: PrisonConfig, seed: int, numbers: Int64s) -> _Batch:
     """Simulate the episodes `numbers` [B] of `seed` together; what happens in one depends on no other."""
     draws = Draws(seed, numbers)
     places, search = _Places.draw(draws), Search(config.kinds, draws)
@@ -173,13 +173,13 @@ def _run(config: PrisonConfig, seed: int, numbers: NDArray[np.int64]) -> _Batch:
     return _Batch(places, last, np.stack(targets), np.stack(modes), np.stack(movers), np.concatenate(hits, axis=1))
 
 
-def _at(field: NDArray[_Scalar], cell: Array) -> NDArray[_Scalar]:
+def _at(field: NDArray[_Scalar], cell: Float64s) -> NDArray[_Scalar]:
     """Values [...] of a field of the map at cells [..., 2]."""
     index = cell.astype(np.int64)
     return field[index[..., 0], index[..., 1]]
 
 
-def _run_until_home(config: PrisonConfig, seed: int, indices: NDArray[np.int64]) -> tuple[list[_Batch], NDArray[np.int64]]:
+def _run_until_home(config: PrisonConfig, seed: int, indices: Int64s) -> tuple[list[_Batch], Int64s]:
     """Batches, and which of them [B] holds an episode, under which row: [2, B]. Stuck episodes are drawn anew."""
     found = np.full((2, len(indices)), -1)
     batches: list[_Batch] = []
@@ -193,7 +193,7 @@ def _run_until_home(config: PrisonConfig, seed: int, indices: NDArray[np.int64])
     return batches, found
 
 
-def simulate_prison_batch(config: PrisonConfig, seed: int, indices: NDArray[np.int64]) -> Recordings:
+def simulate_prison_batch(config: PrisonConfig, seed: int, indices: Int64s) -> Recordings:
     """The episodes `indices` [E] of `seed`; each depends on nothing but its index, the seed and the settings."""
     indices = np.asarray(indices, dtype=np.int64)
     batches, found = _run_until_home(config, seed, indices)
@@ -223,7 +223,7 @@ def simulate_prison(config: PrisonConfig, seed: int, index: int) -> Episode:
     return simulate_prison_episodes(config, seed, np.array([index]))[0]
 
 
-def simulate_prison_episodes(config: PrisonConfig, seed: int, indices: NDArray[np.int64]) -> list[Episode]:
+def simulate_prison_episodes(config: PrisonConfig, seed: int, indices: Int64s) -> list[Episode]:
     """Several such episodes; together they take a fraction of the time."""
     batches, found = _run_until_home(config, seed, np.asarray(indices, dtype=np.int64))
     return [_episode(config, batches[place], row) for place, row in found.T.tolist()]

@@ -12,9 +12,10 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
+from cadence.arrays import Bools, Float64s, Int64s
 from cadence.worlds.block_route import BlockPlanner
-from cadence.worlds.draws import Array, Draws, Indices
-from cadence.worlds.prison_map import KEEP_OUT, MOUNTAIN, SIDE, Bools, Ints, PrisonMap, prison_map
+from cadence.worlds.draws import Draws
+from cadence.worlds.prison_map import KEEP_OUT, MOUNTAIN, SIDE, PrisonMap, prison_map
 
 MAX_SPEED = 7.5
 MODE_NAMES = ("run", "hide", "give up")
@@ -32,7 +33,7 @@ _SLOWED_DOWN = 1
 _STREAM_BLOCK = 31
 
 
-def turn_from(centre: tuple[float, float], here: Array, heading: Array) -> Array:
+def turn_from(centre: tuple[float, float], here: Float64s, heading: Float64s) -> Float64s:
     """The headings [N], turned to the nearer tangent around `centre` where they lead from `here` [N, 2] towards it.
 
     With the original's cases: each compares headings without wrapping them.
@@ -46,41 +47,41 @@ def turn_from(centre: tuple[float, float], here: Array, heading: Array) -> Array
     beyond = np.where(is_third, (heading < one) | (heading > two), (heading > one) | (heading < two))
     is_towards = np.where(is_third | is_second, beyond, between)
     nearer = np.where(_angle_between(heading, one) < _angle_between(heading, two), one, two)
-    turned: Array = np.where(is_towards, nearer, heading)
+    turned: Float64s = np.where(is_towards, nearer, heading)
     return turned
 
 
-def _angle_between(one: Array, other: Array) -> Array:
+def _angle_between(one: Float64s, other: Float64s) -> Float64s:
     difference = one - other
-    least: Array = np.minimum(np.abs(difference), np.minimum(np.abs(difference + 2 * np.pi), np.abs(difference - 2 * np.pi)))
+    least: Float64s = np.minimum(np.abs(difference), np.minimum(np.abs(difference + 2 * np.pi), np.abs(difference - 2 * np.pi)))
     return least
 
 
-def straight_out(centre: tuple[float, float], here: Array) -> Array:
+def straight_out(centre: tuple[float, float], here: Float64s) -> Float64s:
     """Headings [N] from `centre` through `here` [N, 2]."""
     inwards = np.arctan2(centre[1] - here[:, 1], centre[0] - here[:, 0])
-    outwards: Array = np.where(inwards < 0, inwards + np.pi, inwards - np.pi)
+    outwards: Float64s = np.where(inwards < 0, inwards + np.pi, inwards - np.pi)
     return outwards
 
 
-def stride(here: Array, speed: Array, heading: Array) -> Array:
+def stride(here: Float64s, speed: Float64s, heading: Float64s) -> Float64s:
     """Where a move [N] of float32 speed and heading leads: whole cells, kept on the map."""
     pace, turn = speed.astype(np.float32), heading.astype(np.float32)
     step = np.stack([np.cos(turn), np.sin(turn)], axis=-1) * pace[:, None]
-    moved: Array = np.clip(np.rint(here + step), 0.0, SIDE - 1.0)
+    moved: Float64s = np.clip(np.rint(here + step), 0.0, SIDE - 1.0)
     return moved
 
 
-def heading_to(here: Array, goal: Array) -> Array:
+def heading_to(here: Float64s, goal: Float64s) -> Float64s:
     """Headings [N] from `here` to `goal` [N, 2]."""
-    angle: Array = np.arctan2(goal[:, 1] - here[:, 1], goal[:, 0] - here[:, 0])
+    angle: Float64s = np.arctan2(goal[:, 1] - here[:, 1], goal[:, 0] - here[:, 0])
     return angle
 
 
-def distance_between(one: Array, other: Array) -> Array:
+def distance_between(one: Float64s, other: Float64s) -> Float64s:
     """Distances [...] of points [..., 2]; exact for whole cells."""
     offset = one - other
-    length: Array = np.sqrt((offset * offset).sum(axis=-1))
+    length: Float64s = np.sqrt((offset * offset).sum(axis=-1))
     return length
 
 
@@ -94,9 +95,9 @@ class Sight:
     """
 
     step: int
-    here: Array
-    speed: Array
-    tracker: Array
+    here: Float64s
+    speed: Float64s
+    tracker: Float64s
     is_seen: Bools
 
 
@@ -107,10 +108,10 @@ class _Plans:
     point [B, W, 2] way-points; index, last [B] the next one and the final one; here [B, 2] where the plan believes to be
     """
 
-    point: Array
-    index: Ints
-    last: Ints
-    here: Array
+    point: Float64s
+    index: Int64s
+    last: Int64s
+    here: Float64s
 
     @classmethod
     def none(cls, count: int) -> "_Plans":
@@ -118,16 +119,16 @@ class _Plans:
         integer = np.zeros(count, dtype=np.int64)
         return cls(np.zeros((count, 8, 2)), integer.copy(), integer - 1, np.zeros((count, 2)))
 
-    def is_spent(self, rows: Indices) -> Bools:
+    def is_spent(self, rows: Int64s) -> Bools:
         """Whether nothing is left to do."""
         spent: Bools = self.index[rows] > self.last[rows]
         return spent
 
-    def discard(self, rows: Indices) -> None:
+    def discard(self, rows: Int64s) -> None:
         """Forget the plans of these rows."""
         self.last[rows] = self.index[rows] - 1
 
-    def put(self, row: int, here: Array, points: Array) -> None:
+    def put(self, row: int, here: Float64s, points: Float64s) -> None:
         """A new plan for one row."""
         if len(points) > self.point.shape[1]:
             more = len(points) - self.point.shape[1]
@@ -136,7 +137,7 @@ class _Plans:
         self.index[row], self.last[row], self.here[row] = 0, len(points) - 1, here
         self._skip_reached(np.array([row]))
 
-    def take(self, rows: Indices) -> tuple[Array, Array]:
+    def take(self, rows: Int64s) -> tuple[Float64s, Float64s]:
         """The next moves: speed, heading [N]."""
         goal, here = self.point[rows, self.index[rows]], self.here[rows]
         speed = np.minimum(distance_between(here, goal), MAX_SPEED)
@@ -145,7 +146,7 @@ class _Plans:
         self._skip_reached(rows)
         return speed, heading
 
-    def _skip_reached(self, rows: Indices) -> None:
+    def _skip_reached(self, rows: Int64s) -> None:
         while len(rows):
             there = (self.here[rows] == self.point[rows, self.index[rows]]).all(axis=1)
             rows = rows[there]
@@ -160,9 +161,9 @@ class Fugitives:
     camera [B, C, 2] are the cameras they know. `act` gives their next moves; `mode` [B] then says what they are doing.
     """
 
-    goal: Array
-    refuge: Array
-    camera: Array
+    goal: Float64s
+    refuge: Float64s
+    camera: Float64s
     num_helicopters: int
     draws: Draws
     mode: NDArray[np.int8] = field(init=False)
@@ -179,7 +180,7 @@ class Fugitives:
         self._was_tracked = np.zeros((count, _MEMORY), dtype=bool)
         self._ground: PrisonMap = prison_map()
 
-    def act(self, rows: Indices, sight: Sight) -> tuple[Array, Array]:
+    def act(self, rows: Int64s, sight: Sight) -> tuple[Float64s, Float64s]:
         """Speed and heading [N] of the episodes `rows` [N]; `sight` holds all episodes."""
         here, seen = sight.here[rows], sight.is_seen[rows]
         tracker_range = distance_between(sight.tracker[rows], here[:, None])
@@ -216,7 +217,7 @@ class Fugitives:
                 speed[chosen], heading[chosen] = hide(part, here[chosen], in_forest[chosen], long[chosen] > 180)
         return speed, heading
 
-    def _run(self, rows: Indices, here: Array, step: int) -> tuple[Array, Array]:
+    def _run(self, rows: Int64s, here: Float64s, step: int) -> tuple[Float64s, Float64s]:
         """Along the plan; where none is left, along a new one to the nearest hideout."""
         fresh = np.flatnonzero(self._plans.is_spent(rows))
         self._aim[rows[fresh]] = distance_between(self.goal[rows[fresh]], here[fresh, None]).argmin(axis=1)
@@ -224,7 +225,7 @@ class Fugitives:
             self._plans.put(row, place, self._way(row, place, step))
         return self._plans.take(rows)
 
-    def _way(self, row: int, here: Array, step: int) -> Array:
+    def _way(self, row: int, here: Float64s, step: int) -> Float64s:
         """Way-points [W, 2] from `here` to the hideout aimed at: corners of blocks, stretched to the map, then the hideout."""
         planner, goal = _planner(), self.goal[row, self._aim[row]]
         scale = SIDE / planner.side
@@ -236,11 +237,11 @@ class Fugitives:
         way = planner.plan(int(start[0] * planner.side + start[1]), int(end[0] * planner.side + end[1]))
         return np.concatenate([np.floor(way[1:] * scale), goal[None]])
 
-    def _give_up(self, rows: Indices, here: Array) -> tuple[Array, Array]:
+    def _give_up(self, rows: Int64s, here: Float64s) -> tuple[Float64s, Float64s]:
         """At full speed to the known hideout."""
         return _avoid(here, np.full(len(rows), MAX_SPEED), heading_to(here, self.refuge[rows]))
 
-    def _turn_elsewhere(self, rows: Indices, here: Array) -> tuple[Array, Array]:
+    def _turn_elsewhere(self, rows: Int64s, here: Float64s) -> tuple[Float64s, Float64s]:
         """Creep towards the nearest of the hideouts that it did not make for, and make for that one."""
         length = distance_between(self.goal[rows], here[:, None])
         length[np.arange(self.goal.shape[1]) == self._aim[rows, None]] = np.inf
@@ -249,12 +250,14 @@ class Fugitives:
         self._note[rows] = _SLOWED_DOWN
         return _avoid(here, np.ones(len(rows)), self._heading[rows])
 
-    def _seek_forest(self, rows: Indices, here: Array, fear: int) -> None:
+    def _seek_forest(self, rows: Int64s, here: Float64s, fear: int) -> None:
         """Begin to run: towards the nearest dense forest, and on in that direction."""
         self._fear[rows] = fear
         self._heading[rows] = heading_to(here, nearest_forest(self._ground.is_dense, here))
 
-    def _hide_from_helicopter(self, rows: Indices, here: Array, in_forest: Bools, is_hopeless: Bools) -> tuple[Array, Array]:
+    def _hide_from_helicopter(
+        self, rows: Int64s, here: Float64s, in_forest: Bools, is_hopeless: Bools
+    ) -> tuple[Float64s, Float64s]:
         self._plans.discard(rows)
         has_begun = self._fear[rows] == _FROM_HELICOPTER
         begins, turns = ~has_begun, has_begun & in_forest & (self._note[rows] != _SLOWED_DOWN)
@@ -267,7 +270,7 @@ class Fugitives:
         self.mode[rows[ends]] = _GIVE_UP
         return speed, heading
 
-    def _hide_from_party(self, rows: Indices, here: Array, in_forest: Bools, is_hopeless: Bools) -> tuple[Array, Array]:
+    def _hide_from_party(self, rows: Int64s, here: Float64s, in_forest: Bools, is_hopeless: Bools) -> tuple[Float64s, Float64s]:
         self._plans.discard(rows)
         is_almost_safe = in_forest & (self._fear[rows] == _FROM_HELICOPTER)
         turns = is_almost_safe & (self._note[rows] != _SLOWED_DOWN)
@@ -284,7 +287,7 @@ def _planner() -> BlockPlanner:
     return BlockPlanner(prison_map().planning, _PRICE_OF_LIGHT)
 
 
-def _first(is_seen: Bools, length: Array) -> tuple[Bools, Array]:
+def _first(is_seen: Bools, length: Float64s) -> tuple[Bools, Float64s]:
     """Whether any tracker [N, K] is seen, and the distance [N] to the first of them that is."""
     if not is_seen.shape[1]:
         return np.zeros(len(is_seen), dtype=bool), np.full(len(is_seen), np.inf)
@@ -292,7 +295,7 @@ def _first(is_seen: Bools, length: Array) -> tuple[Bools, Array]:
     return any_seen, length[np.arange(len(length)), is_seen.argmax(axis=1)]
 
 
-def _avoid(here: Array, speed: Array, heading: Array) -> tuple[Array, Array]:
+def _avoid(here: Float64s, speed: Float64s, heading: Float64s) -> tuple[Float64s, Float64s]:
     """Speed and heading [N] of moves that lead past the mountain: along its edge within 150 cells, straight out within 140."""
     heading = heading.astype(np.float32).astype(np.float64)
     length = distance_between(stride(here, speed, heading), np.array(MOUNTAIN))
@@ -304,7 +307,7 @@ def _avoid(here: Array, speed: Array, heading: Array) -> tuple[Array, Array]:
 
 
 @cache
-def _hiding_offsets() -> Ints:
+def _hiding_offsets() -> Int64s:
     """Offsets [K, 2] of the cells that are searched for a hiding place, nearest first, of equals the last in reading order."""
     along = np.arange(-_HIDING_RANGE, _HIDING_RANGE)
     offset = np.stack(np.meshgrid(along, along, indexing="ij"), axis=-1).reshape(-1, 2)
@@ -312,10 +315,10 @@ def _hiding_offsets() -> Ints:
     return offset[order[1:]]
 
 
-def nearest_forest(is_dense: Bools, here: Array) -> Array:
+def nearest_forest(is_dense: Bools, here: Float64s) -> Float64s:
     """The nearest dense forest [N, 2] other than the own cell, at most 250 cells away on either axis."""
     offsets, place = _hiding_offsets(), here.astype(np.int64)
-    found: Array = np.tile(np.array(_NOWHERE_TO_HIDE, dtype=np.float64), (len(here), 1))
+    found: Float64s = np.tile(np.array(_NOWHERE_TO_HIDE, dtype=np.float64), (len(here), 1))
     rows = np.arange(len(here))
     for begin, end in ((0, 400), (400, 8000), (8000, len(offsets))):
         cell = place[rows, None] + offsets[begin:end]

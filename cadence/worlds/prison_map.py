@@ -8,13 +8,9 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cadence.arrays import Bools, Float64s, Int64s
 from cadence.worlds.perlin import enlarge_twice, fractal
-
-Array = NDArray[np.float64]
-Bools = NDArray[np.bool_]
-Ints = NDArray[np.int64]
 
 CELL_M = 21.0
 SIDE = 2428
@@ -26,7 +22,7 @@ KEEP_OUT = 140.0
 """Movers that come nearer to the centre of the mountain turn straight away from it."""
 
 
-def _cells(text: str) -> Ints:
+def _cells(text: str) -> Int64s:
     """Cells [N, 2] from numbers in a text."""
     return np.array(text.split(), dtype=np.int64).reshape(-1, 2)
 
@@ -75,10 +71,10 @@ class PrisonMap:
     planning     [114, 114] least coverage of blocks of 20 x 20 cells, -1 where there is mountain
     """
 
-    coverage: Array
+    coverage: Float64s
     is_mountain: Bools
     is_dense: Bools
-    planning: Array
+    planning: Float64s
 
 
 @cache
@@ -91,7 +87,7 @@ def prison_map() -> PrisonMap:
     return PrisonMap(coverage, is_mountain, _dense_patches(coverage), _planning_grid(np.where(is_mountain, -1.0, coverage)))
 
 
-def _coverage() -> Array:
+def _coverage() -> Float64s:
     """The landscape number 80 of the original, darkened. In float64 as there: routes depend on the last bits."""
     half = SIDE // 2
     place = (np.arange(half) / 250.0).astype(np.float32)
@@ -102,7 +98,7 @@ def _coverage() -> Array:
     return coverage
 
 
-def _dense_patches(coverage: Array) -> Bools:
+def _dense_patches(coverage: Float64s) -> Bools:
     """Cells with more than 17 dense cells among the 36 from three before to two behind; none near the edges at 0."""
     dense = np.zeros((SIDE + 3, SIDE + 3), dtype=np.int64)
     dense[1 : SIDE + 1, 1 : SIDE + 1] = coverage < _DENSE_BELOW
@@ -113,7 +109,7 @@ def _dense_patches(coverage: Array) -> Bools:
     return count > 17
 
 
-def _planning_grid(ground: Array) -> Array:
+def _planning_grid(ground: Float64s) -> Float64s:
     """Least value of each block; like the original it drops eight blocks at the far edges instead of eight cells.
 
     The planner stretches these 114 blocks over the whole map, so that its mountain lies beside the real one.
@@ -123,5 +119,5 @@ def _planning_grid(ground: Array) -> Array:
     padded[:SIDE, :SIDE] = ground
     blocks = padded.reshape(whole // _POOL, _POOL, whole // _POOL, _POOL).min(axis=(1, 3))
     rest = SIDE % _POOL
-    grid: Array = blocks[:-rest, :-rest]
+    grid: Float64s = blocks[:-rest, :-rest]
     return grid

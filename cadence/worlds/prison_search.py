@@ -10,9 +10,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from cadence.worlds.draws import Array, Draws, Indices
+from cadence.arrays import Bools, Float64s, Int64s
+from cadence.worlds.draws import Draws
 from cadence.worlds.prison_fugitive import distance_between, straight_out, turn_from
-from cadence.worlds.prison_map import KEEP_OUT, MOUNTAIN, SIDE, Bools, Ints, prison_map
+from cadence.worlds.prison_map import KEEP_OUT, MOUNTAIN, SIDE, prison_map
 from cadence.worlds.pursuit import ARRIVED, CHASE_SPEED, MEET_SPEED, SPIRAL_SPEED, MoverKind, is_working
 
 _TURN_OFF, _NO_DESTINATION, _SPIRAL_AT_ONCE = 160.0, 161.0, 170.0
@@ -24,26 +25,26 @@ _GO, _SPIRAL, _LINE = range(3)
 _STREAM_START, _STREAM_RANDOM, _STREAM_NEAR, _STREAM_APPROACH = 21, 22, 23, 24
 
 
-def _spiral() -> Ints:
+def _spiral() -> Int64s:
     """Corners [14, 2] of the square spiral relative to its middle."""
     sides = np.repeat(np.arange(1, _SPIRAL_SIDES), 2)
     turns = np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])[np.arange(len(sides)) % 4]
-    corners: Ints = np.cumsum(turns * sides[:, None] * _SPIRAL_UNIT, axis=0)
+    corners: Int64s = np.cumsum(turns * sides[:, None] * _SPIRAL_UNIT, axis=0)
     return corners
 
 
-def leaves_map(point: Array | Ints) -> Bools:
+def leaves_map(point: Float64s | Int64s) -> Bools:
     """Whether points [..., 2] lie off the map or on its outermost cells."""
     outside: Bools = np.any((point < 1) | (point >= SIDE - 1), axis=-1)
     return outside
 
 
-def _is_near_mountain(point: Array, radius: float) -> Bools:
+def _is_near_mountain(point: Float64s, radius: float) -> Bools:
     near: Bools = distance_between(point, np.array(MOUNTAIN)) <= radius
     return near
 
 
-def move(here: Array, direction: Array, speed: Array) -> Array:
+def move(here: Float64s, direction: Float64s, speed: Float64s) -> Float64s:
     """One step [N, 2] of movers at cells `here`, turned along or away from the mountain, kept on the map."""
     moved = np.rint(here + direction * speed[:, None])
     near = np.flatnonzero(_is_near_mountain(moved, _TURN_OFF))
@@ -66,7 +67,7 @@ class Search:
 
     kinds: tuple[MoverKind, ...]
     draws: Draws
-    _leg: Ints = field(init=False)
+    _leg: Int64s = field(init=False)
 
     def __post_init__(self) -> None:
         num_episodes, num_movers = len(self.draws), len(self.kinds)
@@ -87,11 +88,11 @@ class Search:
         self._go_anywhere(everybody, 0)
 
     @property
-    def position(self) -> Array:
+    def position(self) -> Float64s:
         """Where the movers are [B, M, 2]; a view that `advance` changes."""
         return self._here.reshape(len(self.draws), len(self.kinds), 2)
 
-    def notice(self, step: int, is_detected: Bools, target: Array) -> None:
+    def notice(self, step: int, is_detected: Bools, target: Float64s) -> None:
         """Tell the movers what was detected at `step`: in which episodes [B], and the target's position there [B, 2]."""
         if not is_detected.any():
             return
@@ -113,12 +114,12 @@ class Search:
         moving = self._listening(is_running, step + 1)
         self._here[moving] = move(self._here[moving], direction[moving], speed[moving])
 
-    def _listening(self, episodes: Bools, step: int) -> Indices:
+    def _listening(self, episodes: Bools, step: int) -> Int64s:
         """Indices of the movers of these episodes that work at a step."""
         works = np.array([is_working(kind, step) for kind in self.kinds], dtype=bool)
         return np.flatnonzero((episodes[:, None] & works).ravel())
 
-    def _act(self, movers: Indices, step: int) -> tuple[Array, Array]:
+    def _act(self, movers: Int64s, step: int) -> tuple[Float64s, Float64s]:
         """Directions [n, 2] and speeds [n] that the plans ask for; finished legs are struck off."""
         head, here, top = self._head[movers], self._here[movers], self._top[movers]
         leg, place = self._leg[movers, head], self._place[movers, head].copy()
@@ -141,7 +142,7 @@ class Search:
         self._plan_spiral(movers[idle & (leg == _GO)], step)
         return direction, np.minimum(speed, top)
 
-    def _approachable(self, movers: Indices, step: int) -> Array:
+    def _approachable(self, movers: Int64s, step: int) -> Float64s:
         """Destinations [n, 2] of the legs in hand as whole cells; those near the mountain are drawn anew, for good."""
         head = self._head[movers]
         goal = np.trunc(self._place[movers, head])
@@ -154,7 +155,7 @@ class Search:
         self._leg[movers[changed], head[changed]] = _GO
         return goal
 
-    def _go_near(self, movers: Indices, place: Array, step: int) -> None:
+    def _go_near(self, movers: Int64s, place: Float64s, step: int) -> None:
         """Plan to go to places [n, 2], or to others within 200 cells of those that are not allowed."""
         goal = place.copy()
         wrong, attempt = np.arange(len(movers)), 0
@@ -166,7 +167,7 @@ class Search:
             attempt += 1
         self._begin(movers, goal)
 
-    def _go_anywhere(self, movers: Indices, step: int) -> None:
+    def _go_anywhere(self, movers: Int64s, step: int) -> None:
         """Plan to go to a random place off the mountain."""
         is_mountain = prison_map().is_mountain
         place, wrong, attempt = np.zeros((len(movers), 2)), np.arange(len(movers)), 0
@@ -176,12 +177,12 @@ class Search:
             wrong, attempt = wrong[is_mountain[cell[:, 0], cell[:, 1]]], attempt + 1
         self._go_near(movers, place, step)
 
-    def _begin(self, movers: Indices, place: Array) -> None:
+    def _begin(self, movers: Int64s, place: Float64s) -> None:
         """A new plan of one leg, to places [n, 2]."""
         self._head[movers], self._end[movers] = 0, 1
         self._leg[movers, 0], self._place[movers, 0] = _GO, place
 
-    def _plan_spiral(self, movers: Indices, step: int) -> None:
+    def _plan_spiral(self, movers: Int64s, step: int) -> None:
         """Plan a spiral around here; away from the mountain a journey to a random place comes before it."""
         if not len(movers):
             return
@@ -199,7 +200,7 @@ class Search:
         self._end[movers] = first + count
         self._go_anywhere(movers[self._end[movers] == 0], step)
 
-    def _intercept(self, movers: Indices, step: int, report: Array) -> None:
+    def _intercept(self, movers: Int64s, step: int, report: Float64s) -> None:
         """Plan to cut off a target that was seen at `report` [B, 2] at `step`, with the speed and heading it had since then."""
         if not len(movers):
             return
@@ -230,18 +231,18 @@ class Search:
         self._slow[part] = np.where(meets, MEET_SPEED, CHASE_SPEED)[lines]
         self._head[movers[crosses & (to_foot == 0)]] = 1
 
-    def _near(self, movers: Indices, middle: Array, step: int, stream: int, attempt: int) -> Array:
+    def _near(self, movers: Int64s, middle: Float64s, step: int, stream: int, attempt: int) -> Float64s:
         """A random cell [n, 2] within 200 cells of `middle` [n, 2] on either axis."""
         share = self._share(movers, step, stream, attempt)
-        cell: Array = np.trunc(middle - _SCATTER) + np.floor(share * (2 * _SCATTER))
+        cell: Float64s = np.trunc(middle - _SCATTER) + np.floor(share * (2 * _SCATTER))
         return cell
 
-    def _share(self, movers: Indices, step: int, stream: int, attempt: int) -> Array:
+    def _share(self, movers: Int64s, step: int, stream: int, attempt: int) -> Float64s:
         index = self._mover[movers] + len(self.kinds) * attempt
         return self.draws.point(self._row[movers], stream, step, index)
 
 
-def _foot_of_perpendicular(here: Array, target: Array, heading: Array) -> Array:
+def _foot_of_perpendicular(here: Float64s, target: Float64s, heading: Float64s) -> Float64s:
     """Cells [N, 2] on the line through `target` along `heading` [N] that are nearest to `here`, by the slopes of both lines.
 
     Due west the slopes are as good as infinite and the height is what is left of their last bits.

@@ -28,11 +28,9 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cadence.worlds.draws import Array, Draws, Indices
-
-Mask = NDArray[np.bool_]
+from cadence.arrays import Bools, Float64s, Int64s
+from cadence.worlds.draws import Draws
 
 STEPS_ON, STEPS_OFF = 200, 40
 ARRIVED = 10.0
@@ -47,11 +45,11 @@ _SCATTER = 200.0
 _GO, _SPIRAL, _LINE, _NOTHING = range(4)
 
 
-def _spiral_offsets() -> Array:
+def _spiral_offsets() -> Float64s:
     """Corners [14, 2] of the square spiral relative to its middle: sides of 1, 1, 2, 2 ... 7, 7 units."""
     sides = np.repeat(np.arange(1, 8), 2)
     turns = np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])[np.arange(14) % 4]
-    offsets: Array = np.cumsum(turns * sides[:, None] * _SPIRAL_UNIT, axis=0)
+    offsets: Float64s = np.cumsum(turns * sides[:, None] * _SPIRAL_UNIT, axis=0)
     return offsets
 
 
@@ -78,35 +76,35 @@ class Ground(Protocol):
     """What a world tells its searchers; all points are [N, 2]."""
 
     @property
-    def size(self) -> Array:
+    def size(self) -> Float64s:
         """Width and height."""
         ...
 
-    def is_outside(self, point: Array) -> Mask:
+    def is_outside(self, point: Float64s) -> Bools:
         """Where plans may not lead because it is off the map."""
         ...
 
-    def is_closed(self, point: Array) -> Mask:
+    def is_closed(self, point: Float64s) -> Bools:
         """Where plans may not lead because of an obstacle."""
         ...
 
-    def ends_spiral(self, point: Array) -> Mask:
+    def ends_spiral(self, point: Float64s) -> Bools:
         """Corners at which a spiral breaks off."""
         ...
 
-    def ends_line(self, point: Array, ahead: Array, speed: Array) -> Mask:
+    def ends_line(self, point: Float64s, ahead: Float64s, speed: Float64s) -> Bools:
         """Where a mover of top `speed` [N] on a line, about to go from `point` to `ahead`, has come to its end."""
         ...
 
-    def settle(self, point: Array, heading: Array, otherwise: Array) -> Array:
+    def settle(self, point: Float64s, heading: Float64s, otherwise: Float64s) -> Float64s:
         """A foot of the perpendicular, moved along the heading to where it is allowed."""
         ...
 
-    def aim(self, position: Array, goal: Array) -> Array:
+    def aim(self, position: Float64s, goal: Float64s) -> Float64s:
         """The point to make for now on the way to the goal."""
         ...
 
-    def move(self, position: Array, direction: Array, speed: Array) -> Array:
+    def move(self, position: Float64s, direction: Float64s, speed: Float64s) -> Float64s:
         """Where a mover gets in one step."""
         ...
 
@@ -148,11 +146,11 @@ class Pursuit:
         self._go_random(everybody, 0)
 
     @property
-    def position(self) -> Array:
+    def position(self) -> Float64s:
         """Where the movers are [B, M, 2]; a view that `advance` changes."""
         return self._position.reshape(*self._shape, 2)
 
-    def notice(self, step: int, is_detected: Mask, target: Array) -> None:
+    def notice(self, step: int, is_detected: Bools, target: Float64s) -> None:
         """Tell the movers what was detected at `step`: in which episodes [B], and the target's position there [B, 2]."""
         if not is_detected.any():
             return
@@ -167,7 +165,7 @@ class Pursuit:
         self._seen[is_detected] = target[is_detected]
         self._seen_step[is_detected] = step
 
-    def advance(self, step: int, is_running: Mask) -> None:
+    def advance(self, step: int, is_running: Bools) -> None:
         """Move from `step` - 1 to `step` in the episodes [B] that go on."""
         movers = self._listening(is_running, step - 1)
         for _ in range(3):  # the next leg may end here, too
@@ -178,12 +176,12 @@ class Pursuit:
         moving = movers[moves]
         self._position[moving] = self._ground.move(self._position[moving], direction[moves], speed[moves])
 
-    def _listening(self, episodes: Mask, step: int) -> Indices:
+    def _listening(self, episodes: Bools, step: int) -> Int64s:
         """Indices of the movers of these episodes that work at a step."""
         works = np.array([is_working(kind, step) for kind in self.kinds])
         return np.flatnonzero((episodes[:, None] & works).ravel())
 
-    def _steer(self, movers: Indices) -> tuple[Array, Array]:
+    def _steer(self, movers: Int64s) -> tuple[Float64s, Float64s]:
         """Unit directions [n, 2] and speeds [n] that the plans ask for."""
         leg, here = self._leg[movers], self._position[movers]
         is_line = leg == _LINE
@@ -198,7 +196,7 @@ class Pursuit:
         speed[points] = np.minimum(speed[points], distance)
         return direction, np.minimum(speed, self._speed[movers])
 
-    def _finish_legs(self, movers: Indices, step: int) -> None:
+    def _finish_legs(self, movers: Int64s, step: int) -> None:
         """Take the next leg where one is finished."""
         leg, here = self._leg[movers], self._position[movers]
         way = self._goal[movers] - here
@@ -217,22 +215,22 @@ class Pursuit:
         self._plan_spiral(movers[arrived & (after == _NOTHING)], step)
         self._go_random(np.concatenate([cornered[is_last], movers[spent]]), step)
 
-    def _ends_line(self, movers: Indices) -> Mask:
+    def _ends_line(self, movers: Int64s) -> Bools:
         here, top = self._position[movers], self._speed[movers]
         speed = np.where(self._fast_steps[movers] > 0, top, np.minimum(self._slow_speed[movers], top))
         return self._ground.ends_line(here, here + self._heading[movers] * speed[:, None], top)
 
-    def _go(self, movers: Indices, goal: Array, after: int, step: int) -> None:
+    def _go(self, movers: Int64s, goal: Float64s, after: int, step: int) -> None:
         """Plan to go to a point, or near it where it is not allowed, and then what `after` says."""
         self._leg[movers], self._after[movers] = _GO, after
         self._goal[movers] = self._allowed(movers, goal, step)
 
-    def _go_random(self, movers: Indices, step: int) -> None:
+    def _go_random(self, movers: Int64s, step: int) -> None:
         if len(movers):
             self._leg[movers], self._after[movers] = _GO, _NOTHING
             self._goal[movers] = self._open_point(movers, step, _STREAM_RANDOM)
 
-    def _plan_spiral(self, movers: Indices, step: int) -> None:
+    def _plan_spiral(self, movers: Int64s, step: int) -> None:
         """A spiral around where the movers are, as far as there is room; a random point where there is none."""
         if not len(movers):
             return
@@ -244,12 +242,12 @@ class Pursuit:
         self._go_random(movers[count == 0], step)
         self._go_corner(movers[count > 0])
 
-    def _go_corner(self, movers: Indices) -> None:
+    def _go_corner(self, movers: Int64s) -> None:
         """Make for the next corner of the spiral."""
         self._leg[movers] = _SPIRAL
         self._goal[movers] = self._middle[movers] + _OFFSETS[self._corner[movers]]
 
-    def _intercept(self, movers: Indices, step: int, target: Array, way: Array, steps: Array) -> None:
+    def _intercept(self, movers: Int64s, step: int, target: Float64s, way: Float64s, steps: Float64s) -> None:
         """Plan to cut off a target [n, 2] that came `way` [n, 2] in `steps` [n]."""
         ground, here, top = self._ground, self._position[movers], self._speed[movers]
         length = np.sqrt((way * way).sum(axis=-1))
@@ -282,7 +280,7 @@ class Pursuit:
         self._after[movers[beside | outside]] = _NOTHING
         self._leg[movers[on_line & (to_foot == 0)]] = _LINE
 
-    def _allowed(self, movers: Indices, goal: Array, step: int) -> Array:
+    def _allowed(self, movers: Int64s, goal: Float64s, step: int) -> Float64s:
         """The goals, each moved within 200 units to where it is allowed if it is not."""
         goal = goal.copy()
         wrong = np.flatnonzero(self._ground.is_closed(goal) | self._ground.is_outside(goal))
@@ -297,7 +295,7 @@ class Pursuit:
             wrong, middle, attempt = wrong[~right], middle[~right], attempt + 1
         return goal
 
-    def _open_point(self, movers: Indices, step: int, stream: int) -> Array:
+    def _open_point(self, movers: Int64s, step: int, stream: int) -> Float64s:
         """A random point of the map that is allowed, a mover [n, 2]."""
         point, wrong, attempt = np.zeros((len(movers), 2)), np.arange(len(movers)), 0
         while len(wrong):
@@ -307,6 +305,6 @@ class Pursuit:
             wrong, attempt = wrong[~right], attempt + 1
         return point
 
-    def _draw(self, movers: Indices, step: int, stream: int, attempt: int) -> Array:
+    def _draw(self, movers: Int64s, step: int, stream: int, attempt: int) -> Float64s:
         index = self._mover[movers] + len(self.kinds) * attempt
         return self._draws.point(self._row[movers], stream, step, index)

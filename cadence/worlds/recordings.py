@@ -14,6 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from cadence.arrays import Bools, Float32s, Float64s, Int64s
 from cadence.types import Context, Detections, WindowBatch
 
 NUM_STEPS = 120
@@ -21,8 +22,6 @@ NUM_STEPS = 120
 
 _SIGMA_M = 1.0
 """Detections are exact; covariances must not be zero. This is far below the step length."""
-
-Int64s = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,10 +41,10 @@ class Recordings:
 
     step_s: float
     offset: Int64s
-    position_m: NDArray[np.float32]
-    is_detected: NDArray[np.bool_]
-    tracker_m: NDArray[np.float32]
-    known_goal_m: NDArray[np.float32]
+    position_m: Float32s
+    is_detected: Bools
+    tracker_m: Float32s
+    known_goal_m: Float32s
     num_agents: int = 1
 
     def __post_init__(self) -> None:
@@ -77,7 +76,7 @@ class Recordings:
         """The same tracks, each an episode of its own."""
         return dataclasses.replace(self, num_agents=1)
 
-    def rates(self) -> NDArray[np.float64]:
+    def rates(self) -> Float64s:
         """Share of steps with a detection, a track [E]."""
         return np.add.reduceat(self.is_detected.astype(np.float64), self.offset[:-1]) / self.length
 
@@ -180,7 +179,7 @@ def cut_windows(
     episode: Int64s,
     step: Int64s,
     *,
-    known_start: bool | NDArray[np.bool_] = True,
+    known_start: bool | Bools = True,
     num_detections: int = 512,
     num_tracker_steps: int = 64,
     seed: int = 0,
@@ -237,17 +236,15 @@ def cut_windows(
     )
 
 
-def _trackers(recordings: Recordings, begin: Int64s, now: Int64s, num_steps: int) -> NDArray[np.float32]:
+def _trackers(recordings: Recordings, begin: Int64s, now: Int64s, num_steps: int) -> Float32s:
     """The trackers at the steps up to `now` [B, H, M, 2]; NaN before the track's first row, `begin`."""
     past = now[:, None] + np.arange(1 - num_steps, 1)
-    trackers: NDArray[np.float32] = recordings.tracker_m[np.maximum(past, begin[:, None])]
+    trackers: Float32s = recordings.tracker_m[np.maximum(past, begin[:, None])]
     trackers[np.less(past, begin[:, None])] = np.nan
     return trackers
 
 
-def _detection_rows(
-    recordings: Recordings, begin: Int64s, now: Int64s, known_start: NDArray[np.bool_], keep: int
-) -> tuple[Int64s, NDArray[np.bool_]]:
+def _detection_rows(recordings: Recordings, begin: Int64s, now: Int64s, known_start: Bools, keep: int) -> tuple[Int64s, Bools]:
     """Rows [B, N] of the last detections from `begin` to `now`, oldest first and left-packed, and which of them exist."""
     found = np.flatnonzero(recordings.is_detected)
     first, stop = np.searchsorted(found, begin), np.searchsorted(found, now, side="right")

@@ -15,7 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from cadence.worlds.draws import Array, Draws, Indices
+from cadence.arrays import Bools, Float64s, Int64s
+from cadence.worlds.draws import Draws
 from cadence.worlds.episode import Episode, SensorReports
 from cadence.worlds.joint import JointRecordings
 from cadence.worlds.recordings import Recordings
@@ -88,16 +89,16 @@ class _Plans:
     spot_m, shift_m [B, A, 2 legs, 2]: where beside the place an agent stops, how far beside the way it walks
     """
 
-    goal: Indices
-    site: Indices
-    wait: Indices
-    is_meeting: NDArray[np.bool_]
-    start_m: Array
-    stride_m: Array
-    rate: Array
-    mood: Indices
-    spot_m: Array
-    shift_m: Array
+    goal: Int64s
+    site: Int64s
+    wait: Int64s
+    is_meeting: Bools
+    start_m: Float64s
+    stride_m: Float64s
+    rate: Float64s
+    mood: Int64s
+    spot_m: Float64s
+    shift_m: Float64s
 
     @classmethod
     def draw(cls, config: RendezvousConfig, draws: Draws) -> "_Plans":
@@ -107,7 +108,7 @@ class _Plans:
         goal = _pick(share[0], len(GOALS_M))
         each, agent = np.repeat(rows, num_agents), np.tile(np.arange(num_agents), len(rows))
 
-        def of_agents(purpose: int) -> Array:
+        def of_agents(purpose: int) -> Float64s:
             return draws.uniform(each, _STREAM_AGENT, purpose, agent).reshape(-1, num_agents)
 
         mood = _pick(np.stack([of_agents(0), of_agents(1)], axis=-1), NUM_MOODS)
@@ -129,20 +130,20 @@ class _Plans:
         )
 
 
-def _pick(share: Array, count: int) -> Indices:
+def _pick(share: Float64s, count: int) -> Int64s:
     """Numbers 0 ... count - 1 out of uniform shares."""
     return (share * count).astype(np.int64)
 
 
-def _disc(share: Array) -> Array:
+def _disc(share: Float64s) -> Float64s:
     """Points [..., 2, 2, 2] uniform in the unit disc, out of uniform shares [..., 8]."""
     share = share.reshape(*share.shape[:-1], 2, 2, 2)
     bearing = 2 * np.pi * share[..., 1]
-    points: Array = np.sqrt(share[..., :1]) * np.stack([np.cos(bearing), np.sin(bearing)], axis=-1)
+    points: Float64s = np.sqrt(share[..., :1]) * np.stack([np.cos(bearing), np.sin(bearing)], axis=-1)
     return points
 
 
-def _starts(draws: Draws, goal_m: Array, num_agents: int) -> Array:
+def _starts(draws: Draws, goal_m: Float64s, num_agents: int) -> Float64s:
     """Starts [B, A, 2] of episodes with these goals [B, 2]."""
     place = ground()
     start = np.zeros((len(draws), num_agents, 2))
@@ -163,22 +164,22 @@ def _starts(draws: Draws, goal_m: Array, num_agents: int) -> Array:
 class _Roll:
     """One episode: truth_m [A, T, 2], mode [A, T], left_step (-1: direct), is_detected [A, T]."""
 
-    truth_m: Array
+    truth_m: Float64s
     mode: NDArray[np.int8]
     left_step: int
-    is_detected: NDArray[np.bool_]
+    is_detected: Bools
 
 
 class _Walk:
     """A way with its length, walked in equal strides; the agent waits at both ends."""
 
-    def __init__(self, points_m: Array, stride_m: float) -> None:
+    def __init__(self, points_m: Float64s, stride_m: float) -> None:
         self._points_m = points_m
         self._at_m = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points_m, axis=0).T))])
         self._stride_m = stride_m
         self.num_steps = int(np.ceil(self._at_m[-1] / stride_m))
 
-    def positions(self, step: Indices) -> Array:
+    def positions(self, step: Int64s) -> Float64s:
         """Where the agent is [T, 2] so many steps [T] after it set out."""
         walked = step * self._stride_m
         return np.stack([np.interp(walked, self._at_m, self._points_m[:, axis]) for axis in (0, 1)], axis=-1)
@@ -203,25 +204,25 @@ def _roll(plans: _Plans, draws: Draws, row: int) -> _Roll:
     return _Roll(truth, mode, left, _seen(draws, row, plans.rate[row], len(steps)))
 
 
-def _walks(plans: _Plans, row: int, leg: int, begins_m: Array, place: int, ends_m: Array) -> list[_Walk]:
+def _walks(plans: _Plans, row: int, leg: int, begins_m: Float64s, place: int, ends_m: Float64s) -> list[_Walk]:
     """The walks of all agents of an episode on one leg."""
     mood, shift, stride = plans.mood[row, :, leg].tolist(), plans.shift_m[row, :, leg], plans.stride_m[row].tolist()
     ways = (way(*leg_of) for leg_of in zip(begins_m, [place] * len(mood), mood, ends_m, shift, strict=True))
     return [_Walk(points, pace) for points, pace in zip(ways, stride, strict=True)]
 
 
-def _seen(draws: Draws, row: int, rate: Array, num_steps: int) -> NDArray[np.bool_]:
+def _seen(draws: Draws, row: int, rate: Float64s, num_steps: int) -> Bools:
     """Which steps [A, T] hold a detection: of each agent its share, drawn without replacement, one at least."""
     num_agents = len(rate)
     address = (np.arange(num_agents)[:, None] * _MAX_STEPS + np.arange(num_steps)).ravel()
     lot = draws.uniform(np.full(address.shape, row), _STREAM_SEEN, 0, address).reshape(num_agents, num_steps)
     count = np.maximum(np.rint(rate * num_steps), 1)
     rank = lot.argsort(axis=1).argsort(axis=1)
-    is_seen: NDArray[np.bool_] = rank < count[:, None]
+    is_seen: Bools = rank < count[:, None]
     return is_seen
 
 
-def simulate_rendezvous_batch(config: RendezvousConfig, seed: int, indices: Sequence[int] | Indices) -> JointRecordings:
+def simulate_rendezvous_batch(config: RendezvousConfig, seed: int, indices: Sequence[int] | Int64s) -> JointRecordings:
     """The episodes `indices` [E] of `seed`; each depends on nothing but its index, the seed and the settings.
 
     Positions are the true ones: noise and clutter exist in logs only.

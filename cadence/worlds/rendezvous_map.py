@@ -12,12 +12,12 @@ import functools
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 
+from cadence.arrays import Bools, Float64s
 from cadence.worlds.perlin import fractal
 from cadence.worlds.route import RouteField, RouteGrid, smooth_path
-from cadence.worlds.terrain import Array, Clearance, Terrain, smooth_field, smooth_polygon
+from cadence.worlds.terrain import Clearance, Terrain, smooth_field, smooth_polygon
 
 SIDE_M = 30000.0
 GOALS_M = 1000.0 * np.array([[-12.5, 11.5], [2.8, 13.0], [13.0, 10.5], [12.8, -11.0], [3.0, -12.8], [-11.5, -12.0]])
@@ -48,16 +48,16 @@ class Ground:
     """
 
     terrain: Terrain
-    cover: Array
+    cover: Float64s
     clearance: Clearance
     grid: RouteGrid
     graphs: tuple[sparse.csr_matrix, ...]
     keep_m: float
 
-    def is_free(self, position_m: Array) -> NDArray[np.bool_]:
+    def is_free(self, position_m: Float64s) -> Bools:
         """Whether points [..., 2] of the map lie in cells that ways may use."""
         column, row = np.moveaxis(np.floor((position_m + SIDE_M / 2) / _CELL_M).astype(np.int64), -1, 0)
-        free: NDArray[np.bool_] = self.grid.is_free[row, column]
+        free: Bools = self.grid.is_free[row, column]
         return free
 
 
@@ -85,7 +85,7 @@ def _field(place: int, mood: int) -> RouteField:
     return RouteField.to(ground().grid, ground().graphs[mood], PLACES_M[place])
 
 
-def way(start_m: Array, place: int, mood: int, end_m: Array, shift_m: Array) -> Array:
+def way(start_m: Float64s, place: int, mood: int, end_m: Float64s, shift_m: Float64s) -> Float64s:
     """Points [P, 2] of the way from `start_m` to `end_m`, a spot at the place of that number (`PLACES_M`).
 
     The way is led beside the cheapest one by `shift_m` [2] (at most `MAX_SHIFT_M` long), except near its ends, and never

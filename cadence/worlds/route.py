@@ -4,11 +4,11 @@ import math
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage, sparse
 from scipy.sparse import csgraph
 
-from cadence.worlds.terrain import Array, Clearance
+from cadence.arrays import Bools, Float64s, Int32s
+from cadence.worlds.terrain import Clearance
 
 # Half of the 8 neighbours (row, column); the graph is undirected.
 _NEIGHBOURS = ((0, 1), (1, 0), (1, 1), (1, -1))
@@ -23,7 +23,7 @@ class RouteGrid:
 
     side_m: float
     cell_m: float
-    is_free: NDArray[np.bool_]
+    is_free: Bools
 
     @classmethod
     def of(cls, clearance: Clearance, cell_m: float, keep_out_m: float) -> "RouteGrid":
@@ -39,12 +39,12 @@ class RouteGrid:
         return cls(clearance.side_m, cell_m, label == 1 + np.argmax(np.bincount(label.ravel())[1:]))
 
     @property
-    def centres_m(self) -> Array:
+    def centres_m(self) -> Float64s:
         """Centres [H, W, 2] of all cells."""
         axis = (np.arange(len(self.is_free)) + 0.5) * self.cell_m - self.side_m / 2
         return np.stack(np.meshgrid(axis, axis), axis=-1)
 
-    def cell_of(self, position_m: Array) -> int:
+    def cell_of(self, position_m: Float64s) -> int:
         """Flat index of the free cell nearest to a point."""
         row, column = np.floor((position_m[::-1] + self.side_m / 2) / self.cell_m).astype(int).clip(0, len(self.is_free) - 1)
         if not self.is_free[row, column]:
@@ -53,7 +53,7 @@ class RouteGrid:
             row, column = rows[nearest], columns[nearest]
         return int(row * len(self.is_free) + column)
 
-    def graph(self, cost: Array) -> sparse.csr_matrix:
+    def graph(self, cost: Float64s) -> sparse.csr_matrix:
         """The undirected graph of free cells; the length of an edge is metres times the mean `cost` [H, W] of its ends."""
         size = len(self.is_free)
         index = np.arange(size * size).reshape(size, size)
@@ -77,18 +77,18 @@ class RouteField:
     """
 
     grid: RouteGrid
-    goal_m: Array
+    goal_m: Float64s
     goal_cell: int
-    next_cell: NDArray[np.int32]
+    next_cell: Int32s
 
     @classmethod
-    def to(cls, grid: RouteGrid, graph: sparse.csr_matrix, goal_m: Array) -> "RouteField":
+    def to(cls, grid: RouteGrid, graph: sparse.csr_matrix, goal_m: Float64s) -> "RouteField":
         """The field of `graph` (see `RouteGrid.graph`) towards the free cell nearest to `goal_m`."""
         goal = grid.cell_of(goal_m)
         _, previous = csgraph.dijkstra(graph, directed=False, indices=[goal], return_predecessors=True)
         return cls(grid, grid.centres_m.reshape(-1, 2)[goal], goal, previous[0])
 
-    def path_from(self, position_m: Array) -> Array:
+    def path_from(self, position_m: Float64s) -> Float64s:
         """Cell centres [P, 2] from the cell of a point to the goal; the point itself is not part of it."""
         cells = [self.grid.cell_of(position_m)]
         while cells[-1] != self.goal_cell:
@@ -97,7 +97,7 @@ class RouteField:
         return (np.stack([columns, rows], axis=-1) + 0.5) * self.grid.cell_m - self.grid.side_m / 2
 
 
-def smooth_path(path_m: Array, clearance: Clearance, keep_out_m: float, sigma_cells: float = 3.0) -> Array:
+def smooth_path(path_m: Float64s, clearance: Clearance, keep_out_m: float, sigma_cells: float = 3.0) -> Float64s:
     """A path [P, 2] of evenly spaced points without the corners of the grid, its ends kept.
 
     Points are averaged along the path. Around places where that would come nearer than `keep_out_m` to an obstacle (raster
@@ -109,7 +109,7 @@ def smooth_path(path_m: Array, clearance: Clearance, keep_out_m: float, sigma_ce
     to_end = np.minimum(np.arange(len(path_m)), np.arange(len(path_m))[::-1])
     share = np.minimum(to_end / (3 * sigma_cells), 1.0)
     for reach in (4, 8, 16):
-        smoothed: Array = path_m + share[:, None] * (average - path_m)
+        smoothed: Float64s = path_m + share[:, None] * (average - path_m)
         is_near = clearance.at_points(smoothed) < keep_out_m
         if not is_near.any():
             return smoothed
@@ -142,11 +142,11 @@ class Craft:
     y_m: float
     heading_rad: float
     speed_mps: float = 0.0
-    route_m: Array = field(default_factory=lambda: np.zeros((0, 2)))
+    route_m: Float64s = field(default_factory=lambda: np.zeros((0, 2)))
     route_index: int = 0
 
     @property
-    def position_m(self) -> Array:
+    def position_m(self) -> Float64s:
         """The present position [2]."""
         return np.array([self.x_m, self.y_m])
 
@@ -155,7 +155,7 @@ class Craft:
         """Whether the route is used up."""
         return self.route_index >= len(self.route_m)
 
-    def take(self, route_m: Array) -> None:
+    def take(self, route_m: Float64s) -> None:
         """Follow a new route from its beginning."""
         self.route_m, self.route_index = route_m, 0
 

@@ -4,9 +4,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cadence.worlds.terrain import Array
+from cadence.arrays import Bools, Float64s
 
 FALSE_ALARM = 1e-4
 """Probability of false alarm that the detection law of a radar is set to."""
@@ -30,7 +29,7 @@ class SensorKind:
     needs_sight: bool
 
 
-def swerling_probability(distance_m: Array, half_range_m: Array) -> Array:
+def swerling_probability(distance_m: Float64s, half_range_m: Float64s) -> Float64s:
     """Detection probability of a fluctuating target in one scan, 0.5 at `half_range_m`, 0 beyond 2.5 times that.
 
     Swerling I: P = P_fa ** (1 / (1 + SNR)), SNR ~ distance ** -4 (Skolnik, Introduction to Radar Systems, chapter 2).
@@ -41,12 +40,12 @@ def swerling_probability(distance_m: Array, half_range_m: Array) -> Array:
     return np.where(ratio <= 2.5, probability, 0.0)
 
 
-def linear_probability(distance_m: Array, certain_range_m: Array) -> Array:
+def linear_probability(distance_m: Float64s, certain_range_m: Float64s) -> Float64s:
     """Detection probability 1 up to `certain_range_m`, falling linearly to 0 at three times that (the Prison Escape law)."""
     return np.clip(1.5 - 0.5 * distance_m / certain_range_m, 0.0, 1.0)
 
 
-def measurement_covariance(offset_m: Array, range_sigma_m: Array, bearing_sigma_rad: Array) -> Array:
+def measurement_covariance(offset_m: Float64s, range_sigma_m: Float64s, bearing_sigma_rad: Float64s) -> Float64s:
     """Covariance [..., 2, 2] of a position measured in range and bearing along `offset_m` [..., 2] (target minus sensor).
 
     First order in the bearing's noise; never narrower across than a tenth of the noise along.
@@ -63,10 +62,10 @@ def measurement_covariance(offset_m: Array, range_sigma_m: Array, bearing_sigma_
     return np.where(near, np.eye(2) * (range_sigma_m**2)[..., None, None], covariance)
 
 
-def draw_noise(covariance_m2: Array, rng: np.random.Generator) -> Array:
+def draw_noise(covariance_m2: Float64s, rng: np.random.Generator) -> Float64s:
     """One normal draw [N, 2] of each covariance [N, 2, 2]."""
     white = rng.standard_normal((*covariance_m2.shape[:-2], 2))
-    noise: Array = (np.linalg.cholesky(covariance_m2) @ white[..., None])[..., 0]
+    noise: Float64s = (np.linalg.cholesky(covariance_m2) @ white[..., None])[..., 0]
     return noise
 
 
@@ -80,7 +79,7 @@ class Sortie:
     turnaround_s: float = 900.0
 
 
-def sweep_track(rng: np.random.Generator, time_s: Array, side_m: float, sortie: Sortie) -> tuple[Array, NDArray[np.bool_]]:
+def sweep_track(rng: np.random.Generator, time_s: Float64s, side_m: float, sortie: Sortie) -> tuple[Float64s, Bools]:
     """Positions [T, 2] of an aircraft that sweeps the map in parallel lanes, and whether it is in the air [T].
 
     It starts at a base at the edge of the map at a random time of its cycle, flies lanes in a random direction each
@@ -108,7 +107,7 @@ def sweep_track(rng: np.random.Generator, time_s: Array, side_m: float, sortie: 
     return track, is_flying
 
 
-def square_search(centre_m: Array, spacing_m: float, num_legs: int = 12) -> Array:
+def square_search(centre_m: Float64s, spacing_m: float, num_legs: int = 12) -> Float64s:
     """Corners [P, 2] of an expanding square around a last known position (IAMSAR manual, pattern SS)."""
     directions = np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
     lengths = spacing_m * (1 + np.arange(num_legs) // 2)
@@ -116,19 +115,19 @@ def square_search(centre_m: Array, spacing_m: float, num_legs: int = 12) -> Arra
     return np.vstack([centre_m, centre_m + np.cumsum(legs, axis=0)])
 
 
-def _on_square(bearing: float) -> Array:
+def _on_square(bearing: float) -> Float64s:
     """The point [2] of the unit square's edge in a direction."""
     direction = np.array([np.cos(bearing), np.sin(bearing)])
-    point: Array = direction / np.abs(direction).max()
+    point: Float64s = direction / np.abs(direction).max()
     return point
 
 
-def _lanes(rng: np.random.Generator, side_m: float, lane_m: float) -> Array:
+def _lanes(rng: np.random.Generator, side_m: float, lane_m: float) -> Float64s:
     """Ends [P, 2] of parallel lanes over the whole map, to and fro, in a random direction and with a random offset."""
     offset = np.arange(-side_m / 2 + rng.uniform(0.2, 1.0) * lane_m, side_m / 2, lane_m)
     reach = 0.46 * side_m
     ends = np.stack([np.tile([-reach, reach, reach, -reach], len(offset))[: 2 * len(offset)], np.repeat(offset, 2)], axis=1)
     turn = 0.5 * np.pi * rng.integers(4) + rng.uniform(-0.25, 0.25)
     rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
-    lanes: Array = np.clip(ends @ rotation.T, -side_m / 2, side_m / 2)
+    lanes: Float64s = np.clip(ends @ rotation.T, -side_m / 2, side_m / 2)
     return lanes

@@ -3,10 +3,9 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
 
-from cadence.worlds.draws import Array
+from cadence.arrays import Float64s, Int64s
 from cadence.worlds.recordings import Recordings
 
 MEASURES = ("length", "rate", "gap", "stride")
@@ -23,11 +22,11 @@ class EpisodeStatistics:
     site   [E] index of the site where an episode ended, -1 where it ended at none
     """
 
-    length: Array
-    rate: Array
-    gap: Array
-    stride: Array
-    site: NDArray[np.int64]
+    length: Float64s
+    rate: Float64s
+    gap: Float64s
+    stride: Float64s
+    site: Int64s
 
     def share_at(self, first: int, stop: int) -> float:
         """Share of the episodes that ended at one of the sites first ... stop - 1."""
@@ -47,7 +46,7 @@ class Distance:
     chance: float
 
 
-def episode_statistics(recordings: Recordings, unit_m: float, sites_m: Array, radius_m: float) -> EpisodeStatistics:
+def episode_statistics(recordings: Recordings, unit_m: float, sites_m: Float64s, radius_m: float) -> EpisodeStatistics:
     """Samples of `recordings`; sites_m [G, 2] in the mission frame, an episode ends at one within `radius_m` of it."""
     place = recordings.position_m.astype(np.float64)
     final = place[recordings.offset[1:] - 1]

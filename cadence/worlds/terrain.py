@@ -5,10 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 from scipy import ndimage
 
-Array = NDArray[np.float64]
+from cadence.arrays import Bools, Float64s
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,8 +20,8 @@ class Terrain:
     """
 
     side_m: float
-    circles_m: Array
-    polygons_m: tuple[Array, ...]
+    circles_m: Float64s
+    polygons_m: tuple[Float64s, ...]
 
     def __post_init__(self) -> None:
         if self.circles_m.ndim != 2 or self.circles_m.shape[1] != 3:
@@ -40,7 +39,7 @@ class Terrain:
         return shapely.STRtree([*shapes, *circles])
 
 
-def blocks_segment(land: shapely.STRtree, start_m: Array, end_m: Array) -> NDArray[np.bool_]:
+def blocks_segment(land: shapely.STRtree, start_m: Float64s, end_m: Float64s) -> Bools:
     """Whether the straight segments from `start_m` [..., 2] to `end_m` [..., 2] touch any obstacle."""
     start, end = np.broadcast_arrays(start_m, end_m)
     lines = shapely.linestrings(np.stack([start, end], axis=-2).reshape(-1, 2, 2))
@@ -50,8 +49,8 @@ def blocks_segment(land: shapely.STRtree, start_m: Array, end_m: Array) -> NDArr
 
 
 def smooth_polygon(
-    centre_m: Array, radius_m: float, rng: np.random.Generator, num_vertices: int = 40, roughness: float = 1.3
-) -> Array:
+    centre_m: Float64s, radius_m: float, rng: np.random.Generator, num_vertices: int = 40, roughness: float = 1.3
+) -> Float64s:
     """A random star-shaped island [V, 2] around `centre_m`, at most `radius_m` from it at any vertex.
 
     The radius is a random Fourier series of the bearing whose terms fall with the frequency, squeezed along a random axis.
@@ -64,7 +63,7 @@ def smooth_polygon(
     shape = radius[:, None] * np.stack([np.cos(bearing), np.sin(bearing)], axis=1) * [1.0, rng.uniform(0.4, 1.0)]
     turn = rng.uniform(0.0, 2 * np.pi)
     shape = shape @ np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
-    polygon: Array = centre_m + shape * (radius_m / np.hypot(*shape.T).max())
+    polygon: Float64s = centre_m + shape * (radius_m / np.hypot(*shape.T).max())
     return polygon
 
 
@@ -78,8 +77,8 @@ def random_archipelago(
     """
     radii = np.geomspace(side_m / 6.5, side_m / 38.0, num_islands) * rng.uniform(0.8, 1.2, num_islands)
     radii = np.concatenate([radii, rng.uniform(side_m / 60.0, side_m / 35.0, num_shoals)])
-    centres: list[Array] = []
-    polygons: list[Array] = []
+    centres: list[Float64s] = []
+    polygons: list[Float64s] = []
     circles: list[tuple[float, float, float]] = []
     shapes: list[shapely.Geometry] = []
     for index, radius in enumerate(radii):
@@ -99,7 +98,7 @@ def random_archipelago(
     return Terrain(side_m, np.array(circles, dtype=np.float64).reshape(-1, 3), tuple(polygons))
 
 
-def smooth_field(rng: np.random.Generator, size: int, scale_cells: float, octaves: int = 3) -> Array:
+def smooth_field(rng: np.random.Generator, size: int, scale_cells: float, octaves: int = 3) -> Float64s:
     """A smooth random field [size, size] in 0..1: sums of blurred noise, halved in scale and in weight each octave."""
     field = np.zeros((size, size))
     for octave in range(octaves):
@@ -107,7 +106,7 @@ def smooth_field(rng: np.random.Generator, size: int, scale_cells: float, octave
         layer = ndimage.gaussian_filter(rng.standard_normal((size, size)), sigma, mode="reflect", truncate=3.0)
         field += layer / (layer.std() * 2**octave)
     low, high = field.min(), field.max()
-    scaled: Array = (field - low) / (high - low)
+    scaled: Float64s = (field - low) / (high - low)
     return scaled
 
 
@@ -120,7 +119,7 @@ class Clearance:
 
     side_m: float
     cell_m: float
-    distance_m: Array
+    distance_m: Float64s
 
     @classmethod
     def of(cls, terrain: Terrain, cell_m: float) -> "Clearance":
@@ -153,7 +152,7 @@ class Clearance:
         size = self.distance_m.shape[0]
         return float(self.distance_m[row, column]) if 0 <= row < size and 0 <= column < size else 0.0
 
-    def at_points(self, position_m: Array) -> Array:
+    def at_points(self, position_m: Float64s) -> Float64s:
         """Raster distance [...] of points [..., 2]; 0 outside the map."""
         index = np.floor((position_m + self.side_m / 2) / self.cell_m).astype(int)
         size = self.distance_m.shape[0]

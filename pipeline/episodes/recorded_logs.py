@@ -8,19 +8,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.compute as pc
 
 from cadence.errors import InputError
 from cadence.worlds.recordings import Recordings
+from pipeline.arrays import Float64s, Int64s
 from pipeline.extract.obstacle_sources import OBSTACLES_NAME
 from pipeline.extract.stage import ExtractConfig, write_tables
 from pipeline.logs.reader import MissionLog, open_log
 from pipeline.mapping.guess import suggest_mapping
 from pipeline.progress import Progress
 from pipeline.tables import read_table
-from pipeline.windows import UNKNOWN_AGENT, Float64s, Int64s
+from pipeline.windows import UNKNOWN_AGENT
 
 GOAL_KEYS = ("known_goal_m", "hideout_known_to_trackers")
 """Keys of a log's Metadata record `mission` that hold [x, y] or a list of them, metres: where the searching side expects it."""
@@ -245,6 +245,6 @@ def _trackers(poses: pa.Table | None, steps_ns: Int64s, target: Float64s, max_ga
 
 def _typical_step(track: Float64s) -> float:
     """Median length of the steps [T, 2] that are not zero; 0 where nothing moves."""
-    length: npt.NDArray[np.float64] = np.hypot(*np.diff(track, axis=0).T)
+    length: Float64s = np.hypot(*np.diff(track, axis=0).T)
     moving = length[length > 0]  # NaN is not
     return float(np.median(moving)) if len(moving) else 0.0

@@ -7,14 +7,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
 
 from cadence import metrics
 from cadence.types import HypothesisSet, WindowBatch
+from pipeline.arrays import Float64s, Int32s, Int64s
 from pipeline.evaluate.matching import matched
-from pipeline.evaluate.scores import PARTS, Draw, Float64s, Int32s, ScoreRow, detection_distances, weight_by_agent
+from pipeline.evaluate.scores import PARTS, Draw, ScoreRow, detection_distances, weight_by_agent
 
 JOINT_METRICS = (
     "joint_energy_score_m", "joint_min_ade_m", "gospa_m", "localisation_error_m", "num_missed", "num_false",
@@ -144,14 +144,12 @@ def _vector_scores(found: HypothesisSet, windows: WindowBatch, truth_m: Tensor, 
     return torch.stack(out, dim=1)
 
 
-def block_of(cells: JointCells, num_windows: int) -> npt.NDArray[np.int64]:
+def block_of(cells: JointCells, num_windows: int) -> Int64s:
     """One of ten blocks of origins of every cell [C]: what is resampled within a log, as its windows overlap."""
     return np.asarray(cells.window.astype(np.int64) * _NUM_BLOCKS // max(num_windows, 1))
 
 
-def summarise_joint(
-    name: str, cells: JointCells, groups: npt.NDArray[np.int64], seed: int = 0, num_resamples: int = 1000
-) -> list[ScoreRow]:
+def summarise_joint(name: str, cells: JointCells, groups: Int64s, seed: int = 0, num_resamples: int = 1000) -> list[ScoreRow]:
     """A row a part and metric, with bootstrap intervals over the groups [C]; counts are of windows."""
     rng = np.random.default_rng(seed)
     rows = []

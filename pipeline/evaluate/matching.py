@@ -9,7 +9,8 @@ from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
 from cadence.types import Detections, HypothesisSet, WindowBatch
-from pipeline.windows import Float64s, MissionWindows, agent_tracks, interpolated
+from pipeline.arrays import Float64s
+from pipeline.windows import MissionWindows, agent_tracks, interpolated
 
 _LEAST_SHARE = 0.5
 

@@ -10,12 +10,12 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
 
 from cadence import metrics
 from cadence.types import Estimator, HypothesisSet, WindowBatch
+from pipeline.arrays import Bools, Float64s, Int32s, Int64s
 
 METRICS = (
     "ade_m", "min_ade_m", "mean_error_m", "energy_score_m", "energy_score_fair_m", "trajectory_energy_score_m",
@@ -41,10 +41,6 @@ IsInside = Callable[[Tensor, Tensor], Tensor]
 _MAX_STATES = 4_000_000
 _MIN_GROUPS = 6
 _NUM_BLOCKS = 10
-
-Float64s = npt.NDArray[np.float64]
-Int32s = npt.NDArray[np.int32]
-Bools = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,7 +180,7 @@ def compare(
     return found
 
 
-def groups_of(cells: Cells, num_windows: int) -> npt.NDArray[np.int64]:
+def groups_of(cells: Cells, num_windows: int) -> Int64s:
     """Bootstrap group of every cell [C]: its agent; with fewer than six agents, its agent and one of ten blocks of origins."""
     agent = cells.agent.astype(np.int64)
     if len(np.unique(agent)) >= _MIN_GROUPS:
@@ -192,9 +188,7 @@ def groups_of(cells: Cells, num_windows: int) -> npt.NDArray[np.int64]:
     return np.asarray(agent * _NUM_BLOCKS + cells.window.astype(np.int64) * _NUM_BLOCKS // max(num_windows, 1))
 
 
-def summarise(
-    name: str, cells: Cells, groups: npt.NDArray[np.int64], seed: int = 0, num_resamples: int = 1000
-) -> list[ScoreRow]:
+def summarise(name: str, cells: Cells, groups: Int64s, seed: int = 0, num_resamples: int = 1000) -> list[ScoreRow]:
     """All rows of one estimator: every metric by part, the main ones by horizon, gap, time to the nearest detection and age."""
     rng = np.random.default_rng(seed)
     rows = []
@@ -212,7 +206,7 @@ def summarise(
 
 
 def energy_ratio(
-    cells: Cells, rival: Cells, part: str, groups: npt.NDArray[np.int64], seed: int = 0, num_resamples: int = 2000
+    cells: Cells, rival: Cells, part: str, groups: Int64s, seed: int = 0, num_resamples: int = 2000
 ) -> metrics.Interval:
     """Energy score over the rival's on the same cells, paired (below 1: ahead of the rival)."""
     is_in = cells.is_in(part)
@@ -331,7 +325,7 @@ def _octaves(distance: Float64s) -> list[tuple[float, float]]:
 
 def _row(
     name: str, part: str, by: str, bounds: tuple[float | None, float | None], metric: str, cells: Cells,
-    groups: npt.NDArray[np.int64], is_in: Bools, rng: np.random.Generator, num_resamples: int,
+    groups: Int64s, is_in: Bools, rng: np.random.Generator, num_resamples: int,
 ) -> ScoreRow:  # fmt: skip
     found = metrics.bootstrap_mean(cells.column(metric)[is_in], groups[is_in], rng, num_resamples)
     return ScoreRow(name, part, by, *bounds, metric, found.value, found.low, found.high, found.num_values, found.num_groups)

@@ -10,8 +10,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from pipeline.arrays import Int64s
 from pipeline.evaluate.joint import JOINT_METRICS, JointCells, block_of, summarise_joint
 from pipeline.evaluate.scores import PARTS, Cells, ScoreRow, energy_ratio, groups_of, summarise
 
@@ -195,7 +195,7 @@ def without_nan(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _groups(missions: Sequence[ScoredMission]) -> tuple[npt.NDArray[np.int64], str]:
+def _groups(missions: Sequence[ScoredMission]) -> tuple[Int64s, str]:
     """Bootstrap group of every pooled cell: its log where there are enough logs, else its agent (and block of time)."""
     own = [next(iter(mission.cells.values())) for mission in missions]
     if len(missions) >= _MIN_LOGS:

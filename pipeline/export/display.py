@@ -7,12 +7,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from pipeline.arrays import Float64s, Int64s
 from pipeline.export.playback import LiveAgent, Scene
 from pipeline.export.scene import Entity, Label, Lines, LineType, Spheres, round_positions
-
-Float64s = npt.NDArray[np.float64]
 
 # Okabe and Ito (2008), "Color Universal Design": told apart with any colour vision; black is left out (dark backgrounds).
 PALETTE = ("#56B4E9", "#E69F00", "#009E73", "#F0E442", "#CC79A7", "#D55E00", "#0072B2")
@@ -42,7 +40,7 @@ class Marks:
     """Detections of one agent, sorted: time_ns [N], position_m [N, 2] in the mission frame."""
 
     agent_id: str
-    time_ns: npt.NDArray[np.int64]
+    time_ns: Int64s
     position_m: Float64s
 
 

@@ -4,18 +4,16 @@ import json
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import shapely
 from shapely.geometry.base import BaseGeometry
 
+from pipeline.arrays import Float64s, Indices
 from pipeline.export import numbers
 from pipeline.export.display import Style
 from pipeline.export.playback import LiveAgent, Scene
 from pipeline.frames import to_geodetic
 from pipeline.logs.writer import foxglove_class
 from pipeline.tables import Frame
-
-Float64s = npt.NDArray[np.float64]
 
 _APPROXIMATED, _KNOWN = 1, 3  # foxglove.LocationFix.PositionCovarianceType
 _REGION_STEPS = 24
@@ -89,7 +87,7 @@ def _region(live: LiveAgent, share: float) -> BaseGeometry:
     return shapely.simplify(shapely.union_all(shapely.convex_hull(pairs)), float(np.median(radius)) * 0.05)
 
 
-def _steps(live: LiveAgent) -> npt.NDArray[np.intp]:
+def _steps(live: LiveAgent) -> Indices:
     num_steps = live.position_m.shape[1]
     return np.unique(np.round(np.linspace(0, num_steps - 1, min(num_steps, _REGION_STEPS)))).astype(np.intp)
 

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from cadence.errors import InputError
 from pipeline.export import numbers
@@ -18,8 +17,6 @@ from pipeline.results import AgentHypotheses, MissionHypotheses, WindowHypothese
 from pipeline.tables import Frame
 from schemas import channels
 from schemas.channels import message_class
-
-Float64s = npt.NDArray[np.float64]
 
 _COLD, _HOT = np.array([70.0, 20.0, 130.0]), np.array([255.0, 215.0, 70.0])
 _UINT8, _FLOAT32 = 1, 7  # foxglove.PackedElementField.NumericType

@@ -4,14 +4,14 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-import numpy.typing as npt
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
+
+from pipeline.arrays import Float64s
 
 if TYPE_CHECKING:
     from pipeline.export.playback import LiveAgent
 
-Float64s = npt.NDArray[np.float64]
 
 _MODE_SHARE = 0.1
 """Smaller groups of hypotheses are stragglers, not modes."""

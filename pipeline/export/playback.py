@@ -7,12 +7,10 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-import numpy.typing as npt
 
+from pipeline.arrays import Float64s, Indices
 from pipeline.export import numbers
 from pipeline.results import AgentHypotheses, MissionHypotheses, WindowHypotheses
-
-Float64s = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,7 +22,7 @@ class LiveAgent:
 
     agent: AgentHypotheses
     window: WindowHypotheses
-    hypothesis: npt.NDArray[np.intp]
+    hypothesis: Indices
     weight: Float64s
     position_m: Float64s
 

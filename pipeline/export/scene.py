@@ -14,11 +14,9 @@ from dataclasses import dataclass
 from enum import IntEnum
 
 import numpy as np
-import numpy.typing as npt
 
+from pipeline.arrays import Float64s, Floats
 from pipeline.logs.wire import DOUBLE, field, varint
-
-Floats = npt.NDArray[np.floating]
 
 
 class LineType(IntEnum):
@@ -91,14 +89,14 @@ def encode_time(time_ns: int) -> bytes:
     return (b"\x08" + varint(seconds) if seconds else b"") + (b"\x10" + varint(nanos) if nanos else b"")
 
 
-def round_positions(position_m: Floats, extent_m: float) -> npt.NDArray[np.float64]:
+def round_positions(position_m: Floats, extent_m: float) -> Float64s:
     """Positions on a grid of 1/16 m for a scene a kilometre wide, finer and coarser in proportion (powers of two).
 
     The eye cannot tell, and the zero bits at the end of every number compress well.
     """
     quantum = 2.0 ** np.round(np.log2(max(extent_m, 1e-6) / 16384.0))
     # Adding zero turns -0.0 into 0.0.
-    rounded: npt.NDArray[np.float64] = np.round(np.asarray(position_m, np.float64) / quantum) * quantum + 0.0
+    rounded: Float64s = np.round(np.asarray(position_m, np.float64) / quantum) * quantum + 0.0
     return rounded
 
 
@@ -160,7 +158,7 @@ def _doubles(value: Sequence[float]) -> bytes:
     return b"".join(struct.pack("<Bd", number << 3 | DOUBLE, one) for number, one in enumerate(value, start=1))
 
 
-def _numbers(wire: bytearray, offset: int, shape: tuple[int, ...], strides: tuple[int, ...]) -> npt.NDArray[np.float64]:
+def _numbers(wire: bytearray, offset: int, shape: tuple[int, ...], strides: tuple[int, ...]) -> Float64s:
     """The doubles that stand at equal distances in `wire`, to be assigned to."""
     return np.ndarray(shape, "<f8", wire, offset, strides)
 

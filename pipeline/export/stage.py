@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 
 from cadence.errors import InputError
+from pipeline.arrays import Float64s
 from pipeline.config import config_as_dict
 from pipeline.export import maps, messages
 from pipeline.export.display import Drawing, Marks, Style, draw, obstacle_entities, scene_entities
@@ -255,7 +255,7 @@ def _style(hypotheses: MissionHypotheses, detections: pa.Table, config: ExportCo
     )
 
 
-def _positions(detections: pa.Table) -> npt.NDArray[np.float64]:
+def _positions(detections: pa.Table) -> Float64s:
     return np.stack([detections["x_m"].to_numpy(), detections["y_m"].to_numpy()], axis=-1)
 
 

@@ -8,8 +8,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
+from pipeline.arrays import Float64s, Int32s, Int64s
 from pipeline.extract.positions import Positions
 
 
@@ -18,7 +18,7 @@ class Collapsed:
     """`positions` sorted by time, and how many detections became each of them [N]."""
 
     positions: Positions
-    num_merged: npt.NDArray[np.int32]
+    num_merged: Int32s
 
 
 def collapse(positions: Positions, tolerance_s: float) -> Collapsed:
@@ -46,7 +46,7 @@ def collapse(positions: Positions, tolerance_s: float) -> Collapsed:
     return Collapsed(merged[is_kept], num_merged[is_kept])
 
 
-def _groups(positions: Positions, tolerance_ns: int) -> Iterator[npt.NDArray[np.int64]]:
+def _groups(positions: Positions, tolerance_ns: int) -> Iterator[Int64s]:
     """Row numbers of every group of two or more."""
     for agent in sorted({agent for agent in positions.agent if agent is not None}):
         rows = np.flatnonzero(positions.agent == agent)
@@ -63,9 +63,7 @@ def _groups(positions: Positions, tolerance_ns: int) -> Iterator[npt.NDArray[np.
             place = end
 
 
-def _merge(
-    position_m: npt.NDArray[np.float64], covariance_m2: npt.NDArray[np.float64]
-) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+def _merge(position_m: Float64s, covariance_m2: Float64s) -> tuple[Float64s, Float64s]:
     """Position [2] and covariance [3] of detections [n, 2], [n, 3]."""
     is_exact = np.isnan(covariance_m2[:, 0])
     if (position_m == position_m[0]).all():

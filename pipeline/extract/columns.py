@@ -8,17 +8,16 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
-import numpy.typing as npt
 from rosbags.interfaces import Nodetype
 from rosbags.typesys.store import Typestore
 
+from pipeline.arrays import Column
 from pipeline.extract.stamps import stamp_ns
 from pipeline.logs.cdr_fields import CdrFields
 from pipeline.logs.channels import Batch, Channel
 from pipeline.logs.decode import UndecodableChannel, cdr_types
 from pipeline.mapping.message_path import Field, MessagePath
 
-Column = npt.NDArray[Any]
 _Entry = tuple[Any, Any]
 
 _INTEGERS: Final = frozenset(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64))

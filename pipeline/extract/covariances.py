@@ -7,9 +7,9 @@ import math
 from typing import Any, Final
 
 import numpy as np
-import numpy.typing as npt
 
-Float64s = npt.NDArray[np.float64]
+from pipeline.arrays import Bools, Float64s
+
 Covariance = tuple[float, float, float, float, float, float]
 
 NONE_COVARIANCE: Final[Covariance] = (math.nan,) * 6
@@ -58,7 +58,7 @@ def _heights(xx: float, xy: float, yy: float, stated: list[float]) -> tuple[floa
     return (xz, yz, zz) if determinant > 0 else (0.0, 0.0, zz)
 
 
-def stated_covariances(matrices: Float64s) -> tuple[Float64s, npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
+def stated_covariances(matrices: Float64s) -> tuple[Float64s, Bools, Bools]:
     """`stated_covariance` of N matrices [N, 4, 6, 9 or 36] at once: covariances [N, 6], which are stated, which are none.
 
     Covariances that are not stated mean nothing.
@@ -83,7 +83,7 @@ def rotated(covariance_m2: Float64s, rotation: Float64s) -> Float64s:
     return np.ascontiguousarray(turned[:, [0, 1, 4, 2, 5, 8]])
 
 
-def are_apart(offset_m: Float64s, covariance_m2: Float64s, other_m2: Float64s) -> npt.NDArray[np.bool_]:
+def are_apart(offset_m: Float64s, covariance_m2: Float64s, other_m2: Float64s) -> Bools:
     """Which of N pairs of positions, `offset_m` [N, 2] from each other, are not views of one place.
 
     Their covariances [N, 3] (xx, xy, yy; NaN: exact) allow for four standard deviations: more in one pair of 3000.
@@ -93,5 +93,5 @@ def are_apart(offset_m: Float64s, covariance_m2: Float64s, other_m2: Float64s) -
     determinant = xx * yy - xy * xy
     with np.errstate(all="ignore"):
         squared = (yy * x * x - 2 * xy * x * y + xx * y * y) / determinant
-    apart: npt.NDArray[np.bool_] = np.where(determinant > 0, squared > _MAX_SIGMAS**2, (x != 0) | (y != 0))
+    apart: Bools = np.where(determinant > 0, squared > _MAX_SIGMAS**2, (x != 0) | (y != 0))
     return apart

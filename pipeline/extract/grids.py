@@ -9,10 +9,10 @@ from collections.abc import Sequence
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import shapely
 from shapely.affinity import affine_transform
 
+from pipeline.arrays import Bools
 from pipeline.logs.decode import field
 
 ROS_GRIDS: Final = ("nav_msgs/msg/OccupancyGrid", "nav_msgs/OccupancyGrid")
@@ -31,7 +31,7 @@ class Grid(NamedTuple):
     """Which cells are occupied [rows, columns], and where the corner of cell (0, 0) lies; x counts along the columns."""
 
     frame_id: str
-    is_occupied: npt.NDArray[np.bool_]
+    is_occupied: Bools
     cell_m: tuple[float, float]
     origin_m: tuple[float, float]
     yaw_rad: float
@@ -97,7 +97,7 @@ def occupied_polygons(grid: Grid) -> list[list[Ring]]:
     ]
 
 
-def _grid(frame_id: str, is_occupied: npt.NDArray[np.bool_], cell_m: tuple[float, float], pose: Any) -> Grid:
+def _grid(frame_id: str, is_occupied: Bools, cell_m: tuple[float, float], pose: Any) -> Grid:
     x, y = (float(field(pose, f"position.{axis}")) for axis in "xy")
     qx, qy, qz, qw = (float(field(pose, f"orientation.{axis}")) for axis in "xyzw")
     yaw = math.atan2(2 * (qw * qz + qx * qy), 1 - 2 * (qy * qy + qz * qz)) if (qx, qy, qz, qw) != (0, 0, 0, 0) else 0.0
@@ -106,7 +106,7 @@ def _grid(frame_id: str, is_occupied: npt.NDArray[np.bool_], cell_m: tuple[float
     return Grid(frame_id, is_occupied, cell_m, (x, y), yaw)
 
 
-def _coarsened(cells: npt.NDArray[np.bool_], cell_m: tuple[float, float]) -> tuple[npt.NDArray[np.bool_], tuple[float, float]]:
+def _coarsened(cells: Bools, cell_m: tuple[float, float]) -> tuple[Bools, tuple[float, float]]:
     """Blocks of cells, occupied where any cell is, so that no grid has more than _MAX_CELLS."""
     block = math.ceil(math.sqrt(cells.size / _MAX_CELLS))
     if block <= 1:
@@ -114,7 +114,7 @@ def _coarsened(cells: npt.NDArray[np.bool_], cell_m: tuple[float, float]) -> tup
     rows, columns = (-size % block for size in cells.shape)
     padded = np.pad(cells, ((0, rows), (0, columns)))
     blocks = padded.reshape(padded.shape[0] // block, block, padded.shape[1] // block, block)
-    coarse: npt.NDArray[np.bool_] = np.asarray(blocks.any(axis=(1, 3)))
+    coarse: Bools = np.asarray(blocks.any(axis=(1, 3)))
     return coarse, (cell_m[0] * block, cell_m[1] * block)
 
 

@@ -8,13 +8,11 @@ from dataclasses import replace
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
+from pipeline.arrays import Bools
 from pipeline.extract.covariances import are_apart
 from pipeline.extract.plausibility import Suspicions
 from pipeline.extract.positions import Positions
-
-Bools = npt.NDArray[np.bool_]
 
 _MAX_SHARED: Final = 0.05
 """Of the messages that hold a name: with more in which it stands at several places it is no name at all; with fewer the odd

@@ -12,9 +12,9 @@ from functools import partial
 from typing import Any, Self
 
 import numpy as np
-import numpy.typing as npt
 
 from cadence.errors import ConfigError
+from pipeline.arrays import Bools, Column, Float32s, Float64s, Int64s, Objects
 from pipeline.extract.columns import FieldColumns, mapped
 from pipeline.extract.covariances import NONE_COVARIANCE, Covariance, isotropic, stated_covariance, stated_covariances
 from pipeline.extract.stamps import stamp_ns
@@ -23,9 +23,6 @@ from pipeline.logs.decode import UndecodableChannel
 from pipeline.logs.reader import Channel, RawMessage
 from pipeline.mapping.message_path import MissingFieldError, Place, at_place, parse_path
 from pipeline.mapping.sources import LOG_TIME, PATH_KEYS, PUBLISH_TIME, SourceConfig, resolve_paths
-
-Float64s = npt.NDArray[np.float64]
-Objects = npt.NDArray[np.object_]
 
 Point = tuple[Place, Any, Any, Any]
 """Place in the message; x, y and z, or latitude, longitude and altitude, as the message has them."""
@@ -43,23 +40,23 @@ class Positions:
     is_stated      whether the user configured the source (else it was suggested)
     """
 
-    time_ns: npt.NDArray[np.int64]
-    log_time_ns: npt.NDArray[np.int64]
-    sequence: npt.NDArray[np.int64]
-    message: npt.NDArray[np.int64]
+    time_ns: Int64s
+    log_time_ns: Int64s
+    sequence: Int64s
+    message: Int64s
     first: Float64s
     second: Float64s
     z_m: Float64s
     covariance_m2: Float64s
     height_covariance_m2: Float64s
-    score: npt.NDArray[np.float32]
+    score: Float32s
     agent: Objects
     sensor: Objects
     topic: Objects
     frame_id: Objects
-    is_geodetic: npt.NDArray[np.bool_]
-    is_ned: npt.NDArray[np.bool_]
-    is_stated: npt.NDArray[np.bool_]
+    is_geodetic: Bools
+    is_ned: Bools
+    is_stated: Bools
 
     def __len__(self) -> int:
         return len(self.time_ns)
@@ -206,7 +203,7 @@ class ChannelReader:
             raise UndecodableChannel(f"{self.channel.topic}: lacks a field")
         return columns
 
-    def read_columns(self, columns: Mapping[str, npt.NDArray[Any]], batch: Batch) -> None:
+    def read_columns(self, columns: Mapping[str, Column], batch: Batch) -> None:
         """Append what `field_columns` read of a batch: rows and counts are those of `read`, one message after the other."""
         message = self.counts["messages"] + 1 + np.arange(len(batch))
         self.counts["messages"] += len(batch)
@@ -282,7 +279,7 @@ class ChannelReader:
             self.counts["bad_covariance"] += 1
             return self.unknown
 
-    def _covariances(self, columns: Mapping[str, npt.NDArray[Any]], num_rows: int) -> Float64s:
+    def _covariances(self, columns: Mapping[str, Column], num_rows: int) -> Float64s:
         """`_covariance` [N, 6] of many messages at once."""
         if "covariance" not in columns:
             return np.tile(np.array(self.unknown), (num_rows, 1))

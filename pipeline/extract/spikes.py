@@ -1,15 +1,15 @@
 """Single positions far off their agent's track: recorder faults, such as a ship that is in another country for a second."""
 
 import numpy as np
-import numpy.typing as npt
 
+from pipeline.arrays import Bools
 from pipeline.extract.positions import Positions
 
 _MIN_DISTANCE_M = 1000.0
 _MIN_RATIO = 10.0
 
 
-def is_spike(positions: Positions, max_speed_mps: float) -> npt.NDArray[np.bool_]:
+def is_spike(positions: Positions, max_speed_mps: float) -> Bools:
     """Which rows [N], sorted by time and in metres, nothing could have reached and left again.
 
     Such a row lies over 1 km, and over ten times as far as its agent's neighbouring rows from each other, from both of them,

@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 
 from cadence.errors import ConfigError, ImplausibleInputError, InputError, NothingDetectedError
+from pipeline.arrays import Objects
 from pipeline.extract.collapse import Collapsed, collapse
 from pipeline.extract.identity import without_false_names
 from pipeline.extract.obstacle_sources import OBSTACLES_NAME, ObstacleSources, collect_obstacles, write_obstacles
@@ -312,7 +312,7 @@ def _detection_table(log_id: str, collapsed: Collapsed) -> pa.Table:
     return _table(columns, DETECTIONS)
 
 
-def _track_table(log_id: str, rows: Positions, key: str, names: npt.NDArray[np.object_], schema: pa.Schema) -> pa.Table:
+def _track_table(log_id: str, rows: Positions, key: str, names: Objects, schema: pa.Schema) -> pa.Table:
     columns = {
         "log_id": pa.array([log_id] * len(rows)), "time_ns": rows.time_ns, key: names,
         "x_m": rows.first, "y_m": rows.second, "z_m": rows.z_m,

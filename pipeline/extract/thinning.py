@@ -5,11 +5,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
 
-BoolArray = npt.NDArray[np.bool_]
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
+from pipeline.arrays import Bools, Float64s, Int64s
 
 
 @dataclass(frozen=True)
@@ -48,7 +45,7 @@ class ThinningConfig:
         return self.noise_m**2 + self.position_floor_m**2
 
 
-def is_seen(time_ns: IntArray, agent: str, config: ThinningConfig) -> BoolArray:
+def is_seen(time_ns: Int64s, agent: str, config: ThinningConfig) -> Bools:
     """Which of one agent's samples [N], sorted by time, fall into a burst. Shifting all times changes nothing."""
     if time_ns.size == 0:
         return np.zeros(0, dtype=np.bool_)
@@ -59,16 +56,16 @@ def is_seen(time_ns: IntArray, agent: str, config: ThinningConfig) -> BoolArray:
     return _apart(time_s, seen, config.min_interval_s) if config.min_interval_s > 0 else seen
 
 
-def noise(num_samples: int, agent: str, config: ThinningConfig) -> FloatArray:
+def noise(num_samples: int, agent: str, config: ThinningConfig) -> Float64s:
     """Noise in metres [N, 2] for one agent's samples; that of a sample does not depend on which samples are seen."""
     return _generator(agent, config.seed, "noise").normal(scale=config.noise_m, size=(num_samples, 2))
 
 
-def _edges(duration_s: float, config: ThinningConfig, generator: np.random.Generator) -> FloatArray:
+def _edges(duration_s: float, config: ThinningConfig, generator: np.random.Generator) -> Float64s:
     """Times at which bursts begin and end. Time 0 falls into a random phase: exponential lengths have no memory."""
     cycle_s = config.mean_gap_s + config.mean_burst_s
     starts_in_burst = generator.random() < config.mean_burst_s / cycle_s
-    pieces: list[FloatArray] = []
+    pieces: list[Float64s] = []
     reached_s = 0.0
     while reached_s <= duration_s:
         num_cycles = int((duration_s - reached_s) / cycle_s * 1.2) + 8
@@ -81,7 +78,7 @@ def _edges(duration_s: float, config: ThinningConfig, generator: np.random.Gener
     return np.cumsum(np.concatenate(pieces))
 
 
-def _apart(time_s: FloatArray, seen: BoolArray, min_interval_s: float) -> BoolArray:
+def _apart(time_s: Float64s, seen: Bools, min_interval_s: float) -> Bools:
     kept = np.zeros_like(seen)
     indices = np.flatnonzero(seen)
     times = time_s[indices]

@@ -9,11 +9,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-import numpy.typing as npt
 
-Float64s = npt.NDArray[np.float64]
-Int64s = npt.NDArray[np.int64]
-Bools = npt.NDArray[np.bool_]
+from pipeline.arrays import Bools, Float64s, Int64s
 
 _EARTH = {"earth", "ecef", "utm", "wgs84"}
 """Frames of the whole earth: the mission's frame lies below them."""

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from cadence.metrics import Interval
-from pipeline.forecast.scores import HORIZONS, EpisodeScores, Float64s
+from pipeline.arrays import Float64s
+from pipeline.forecast.scores import HORIZONS, EpisodeScores
 from pipeline.forecast.tables import comparison
 
 

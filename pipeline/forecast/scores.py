@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
 
@@ -17,6 +16,7 @@ from cadence import metrics
 from cadence.constraints.checker import segments_in_collision, states_in_collision
 from cadence.constraints.obstacles import Obstacles
 from cadence.types import HypothesisSet
+from pipeline.arrays import Float64s, Int64s
 
 HORIZONS = (0, 29, 59, 89, 119)
 """Steps of a window at which the paper reads its scores: the columns 0, 30, 60, 90 and 120 min of its table."""
@@ -35,8 +35,6 @@ SHARES = ("step_length", "states_in_obstacles", "segments_in_obstacles")
 """Means over hypotheses and steps: length of a step in metres; states, and straight ways between states, that touch an
 obstacle."""
 
-Float64s = npt.NDArray[np.float64]
-Int64s = npt.NDArray[np.int64]
 
 _FINEST_M = 0.01
 _BIN = 1.01

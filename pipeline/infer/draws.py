@@ -7,8 +7,9 @@ import torch
 from torch import Tensor
 
 from cadence.types import HypothesisSet, WindowBatch
+from pipeline.arrays import Int64s
 from pipeline.infer.ways import WayWindows
-from pipeline.windows import Int64s, MissionWindows
+from pipeline.windows import MissionWindows
 
 _WINDOWS_AT_ONCE = 32
 _WORST_FIRST = ("guidance_diverged", "infeasible", "ok")

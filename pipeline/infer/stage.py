@@ -25,6 +25,7 @@ from cadence.diffusion.scene import SceneModel, SceneSampling
 from cadence.errors import ConfigError, DeviceError
 from cadence.network.residual import ResidualNetwork, ResidualNetworkConfig
 from cadence.types import Context, Detections, HypothesisSet, WindowBatch
+from pipeline.arrays import Int64s
 from pipeline.checkpoints import DEFAULT, checkpoint_hash, find_checkpoint, load_weights, network_config, read_info
 from pipeline.estimators.paper import absolute_context, absolute_grid, load_absolute
 from pipeline.estimators.scene import load_scene, scene_context, scene_grid
@@ -37,7 +38,7 @@ from pipeline.ingest.stage import CATALOGUE_NAME, read_catalogue
 from pipeline.manifest import StageResult, run_stage
 from pipeline.progress import Progress
 from pipeline.tables import read_table, write_table
-from pipeline.windows import Grid, GridConfig, Int64s, MissionWindows, build_windows, fit_tracks, later_detections
+from pipeline.windows import Grid, GridConfig, MissionWindows, build_windows, fit_tracks, later_detections
 
 _ROWS_AT_ONCE = 48
 _HINDSIGHT_ROWS = 64

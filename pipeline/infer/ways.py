@@ -10,7 +10,6 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.compute as pc
 import torch
@@ -23,12 +22,11 @@ from cadence.association.types import CLUTTER, AssociationConfig, Associations, 
 from cadence.errors import InputError
 from cadence.resampling import systematic
 from cadence.types import Detections, WindowBatch
+from pipeline.arrays import Bools, Float64s, Int64s
 from pipeline.windows import (
     DetectionTrack,
-    Float64s,
     Grid,
     GridConfig,
-    Int64s,
     MissionWindows,
     is_first_or_last,
     kept_tracks,
@@ -383,7 +381,7 @@ def _padded(
     for r, columns in enumerate(index):
         for c, rows in enumerate(columns):
             pick[r, c, : len(rows)] = rows
-    is_observed: npt.NDArray[np.bool_] = pick >= 0
+    is_observed: Bools = pick >= 0
     time_s = np.where(is_observed, (pool.time_ns[pick] - origins_ns[:, None, None]) * 1e-9, 0.0)
     position_m = np.where(is_observed[..., None], pool.position_m[pick] - datum_m[:, None, None], 0.0)
     covariance_m2 = np.where(is_observed[..., None, None], pool.covariance_m2[pick], np.eye(2))

@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-import numpy.typing as npt
 
 from cadence.errors import ConfigError, InputError
+from pipeline.arrays import Int64s
 from pipeline.config import read_config
 from pipeline.logs.decode import Decoder, UndecodableChannel, UndecodableMessage, decoder_for
 from pipeline.logs.decode import field as field_of
@@ -122,7 +122,7 @@ def ingest(
 
 def survey_channels(log: MissionLog, on_bytes: Callable[[int], object] | None = None) -> tuple[CatalogueChannel, ...]:
     """Rates of all channels, and for each whether its first message can be decoded. Reads the whole log once."""
-    times: dict[int, list[npt.NDArray[np.int64]]] = {channel.id: [] for channel in log.channels}
+    times: dict[int, list[Int64s]] = {channel.id: [] for channel in log.channels}
     first: dict[int, tuple[int, bytes]] = {}
     for batch in log.batches(on_bytes=on_bytes):
         number, time_ns = batch.channel.id, int(batch.log_time_ns[0])
@@ -243,9 +243,7 @@ def _try(channel: Channel, data: bytes | None) -> tuple[str | None, str | None]:
     return None, None
 
 
-def _describe(
-    channel: Channel, parts: Sequence[npt.NDArray[np.int64]], trial: tuple[str | None, str | None]
-) -> CatalogueChannel:
+def _describe(channel: Channel, parts: Sequence[Int64s], trial: tuple[str | None, str | None]) -> CatalogueChannel:
     reason, frame_id = trial
     times = np.sort(np.concatenate([*parts, np.empty(0, np.int64)]))
     span_s = float(times[-1] - times[0]) / 1e9 if len(times) else 0.0

@@ -3,8 +3,8 @@
 from dataclasses import dataclass, field
 
 import numpy as np
-import numpy.typing as npt
 
+from pipeline.arrays import Int64s
 from pipeline.logs.health import utc
 from pipeline.logs.reader import Batch, MissionLog
 
@@ -15,8 +15,6 @@ _JUMP_S = 10.0
 _MAX_OFFSET_S = 10 * 366 * 86400.0
 """Log and publish time further apart say nothing: recorders that have no publish time write what they like."""
 _MAX_SENTENCES = 5
-
-Int64s = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True)

@@ -6,13 +6,13 @@ no message is decoded as a whole. What the walk cannot pass (lists of structures
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 from rosbags.interfaces import Nodetype
 from rosbags.typesys.store import Typestore
 
+from pipeline.arrays import Bools, Column, Int64s
 from pipeline.logs.channels import Batch, Channel
 from pipeline.logs.decode import UndecodableChannel, cdr_types
 
@@ -24,9 +24,6 @@ _DTYPES: Final = {
     "int32": "<i4", "uint32": "<u4", "int64": "<i8", "uint64": "<u8", "float32": "<f4", "float64": "<f8",
 }  # fmt: skip
 _MAX_DEPTH: Final = 32
-
-Column = npt.NDArray[Any]
-Places = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -52,7 +49,7 @@ class CdrFields:
         self.is_whole = is_whole
         self.members = _way(channel, set(paths), is_whole)
 
-    def columns(self, batch: Batch) -> tuple[npt.NDArray[np.bool_], dict[str, Column]]:
+    def columns(self, batch: Batch) -> tuple[Bools, dict[str, Column]]:
         """Which of the N messages could be read, and the columns [N] or [N, count] by path (strings as objects).
 
         Messages that are too short, in another byte order, or with strings that are none on the way are not read; their
@@ -75,8 +72,8 @@ class _Walker:
 
     def __init__(self, batch: Batch) -> None:
         self.data, self.end = batch.data, batch.end
-        self.origin: Places = batch.begin + _HEAD_BYTES  # alignment counts from behind the encapsulation
-        self.place: Places = self.origin
+        self.origin: Int64s = batch.begin + _HEAD_BYTES  # alignment counts from behind the encapsulation
+        self.place: Int64s = self.origin
         self.is_sound = self.origin <= self.end
         head = self._gather("V4", np.where(self.is_sound, batch.begin, 0)).view("u1").reshape(-1, _HEAD_BYTES)
         self.is_sound = self.is_sound & (head[:, 0] == _LITTLE_ENDIAN[0]) & (head[:, 1] == _LITTLE_ENDIAN[1])
@@ -117,24 +114,24 @@ class _Walker:
         self.is_sound = self.is_sound & (values != None)  # noqa: E711 - by element
         return values
 
-    def _length(self) -> Places:
+    def _length(self) -> Int64s:
         begin = self._advance(4, 4)
         return self._gather("<u4", begin).astype(np.int64)
 
-    def _advance(self, alignment: int, size: int) -> Places:
+    def _advance(self, alignment: int, size: int) -> Int64s:
         begin = self._aligned(alignment)
         return self._move(begin, begin + size)
 
-    def _aligned(self, alignment: int) -> Places:
+    def _aligned(self, alignment: int) -> Int64s:
         return self.origin + (self.place - self.origin + alignment - 1) // alignment * alignment
 
-    def _move(self, begin: Places, end: Places) -> Places:
+    def _move(self, begin: Int64s, end: Int64s) -> Int64s:
         """Go to `end` where that is inside the message; `begin`, or 0 where it is not."""
         self.is_sound = self.is_sound & (end <= self.end)
         self.place = np.where(self.is_sound, end, self.origin)
         return np.where(self.is_sound, begin, 0)
 
-    def _gather(self, dtype: str, begin: Places) -> Column:
+    def _gather(self, dtype: str, begin: Int64s) -> Column:
         """What lies at the places, read through a view of the data with a stride of one byte."""
         kind = np.dtype(dtype)
         num_places = len(self.data) - kind.itemsize + 1

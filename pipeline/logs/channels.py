@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from pipeline.arrays import Int64s
 from pipeline.logs.rows import Rows
 
 
@@ -46,12 +47,12 @@ class Batch:
     """
 
     channel: Channel
-    log_time_ns: npt.NDArray[np.int64]
+    log_time_ns: Int64s
     publish_time_ns: npt.NDArray[np.uint64]
     sequence: npt.NDArray[np.uint32]
     data: bytes = field(repr=False)
-    begin: npt.NDArray[np.int64]
-    end: npt.NDArray[np.int64]
+    begin: Int64s
+    end: Int64s
 
     def __post_init__(self) -> None:
         columns = (self.log_time_ns, self.publish_time_ns, self.sequence, self.end)
@@ -78,7 +79,7 @@ def raw_messages(channels: Mapping[int, Channel], data: bytes, rows: Rows) -> It
     return _made(named, *times, rows.sequence.tolist(), _payloads(data, rows.begin, rows.end))
 
 
-def _payloads(data: bytes, begin: npt.NDArray[np.int64], end: npt.NDArray[np.int64]) -> Iterator[bytes]:
+def _payloads(data: bytes, begin: Int64s, end: Int64s) -> Iterator[bytes]:
     """The data of messages, copied when they are asked for: a message that was let go leaves its memory to the next."""
     return map(data.__getitem__, map(slice, begin.tolist(), end.tolist()))
 

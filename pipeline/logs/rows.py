@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from mcap.opcode import Opcode
 
+from pipeline.arrays import Int64s
 from pipeline.logs.records import HEAD, INDEX_ENTRY, MAX_TIME_NS, MESSAGE, MESSAGE_HEAD, DamagedRecord, walk
 
 Index = Sequence[tuple[int, npt.NDArray[np.void]]]
@@ -45,8 +46,8 @@ class Rows:
     sequence: npt.NDArray[np.uint32]
     log_time_ns: npt.NDArray[np.uint64]
     publish_time_ns: npt.NDArray[np.uint64]
-    begin: npt.NDArray[np.int64]
-    end: npt.NDArray[np.int64]
+    begin: Int64s
+    end: Int64s
 
     def __post_init__(self) -> None:
         columns = (self.channel_id, self.sequence, self.log_time_ns, self.publish_time_ns, self.end)
@@ -159,7 +160,7 @@ def _walked(data: bytes, is_cut: bool) -> tuple[list[int], Definitions]:
     return offsets, definitions
 
 
-def _between(data: bytes, begin: npt.NDArray[np.int64], end: npt.NDArray[np.int64]) -> Definitions | None:
+def _between(data: bytes, begin: Int64s, end: Int64s) -> Definitions | None:
     """Definitions in the stretches between messages; None where messages overlap or one is not in the index."""
     if (begin > end).any():
         return None
@@ -175,20 +176,20 @@ def _between(data: bytes, begin: npt.NDArray[np.int64], end: npt.NDArray[np.int6
     return definitions
 
 
-def rows_at(data: bytes, offsets: npt.NDArray[np.int64]) -> Rows:
+def rows_at(data: bytes, offsets: Int64s) -> Rows:
     """The messages whose records begin at `offsets`; only their heads are looked at."""
     heads = _heads(data, offsets)
     return _rows_of(heads, offsets, offsets + HEAD.size + heads["length"].astype(np.int64))
 
 
-def _rows_of(heads: npt.NDArray[np.void], begin: npt.NDArray[np.int64], end: npt.NDArray[np.int64]) -> Rows:
+def _rows_of(heads: npt.NDArray[np.void], begin: Int64s, end: Int64s) -> Rows:
     ids, sequence, log_time, publish_time = (
         np.ascontiguousarray(heads[name]) for name in ("channel_id", "sequence", "log_time", "publish_time")
     )
     return Rows(ids, sequence, log_time, publish_time, begin + _MESSAGE.itemsize, end)
 
 
-def _heads(data: bytes, offsets: npt.NDArray[np.int64]) -> npt.NDArray[np.void]:
+def _heads(data: bytes, offsets: Int64s) -> npt.NDArray[np.void]:
     """The heads of the messages at these offsets, `_MESSAGE`."""
     everywhere: npt.NDArray[np.void] = np.ndarray((max(0, len(data) - _MESSAGE.itemsize + 1),), _OPAQUE, data, strides=(1,))
     return everywhere[offsets].view(_MESSAGE)

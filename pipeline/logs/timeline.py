@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import BinaryIO, Final, Literal
 
 import numpy as np
-import numpy.typing as npt
 
 from cadence.errors import InputError
+from pipeline.arrays import Int64s
 from pipeline.logs.channels import Batch, Channel, RawMessage, batches_of, raw_messages
 from pipeline.logs.plan import Block
 from pipeline.logs.records import (
@@ -173,9 +173,7 @@ class Timeline:
         for stretch in np.split(order, cuts):
             yield self._stretch(pieces, rows, owner, stretch)
 
-    def _stretch(
-        self, pieces: list[_Piece], rows: Rows, owner: npt.NDArray[np.int64], stretch: npt.NDArray[np.int64]
-    ) -> list[RawMessage]:
+    def _stretch(self, pieces: list[_Piece], rows: Rows, owner: Int64s, stretch: Int64s) -> list[RawMessage]:
         """The messages rows[stretch], of which `owner` says from which piece they are: every piece is read once."""
         found: list[tuple[int, RawMessage]] = []
         owners = owner[stretch]

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from itertools import groupby
 
 import numpy as np
-import numpy.typing as npt
 
-from pipeline.report.mission import Fan, Floats, Ints, Mission, Points, WindowRow
+from pipeline.arrays import Bools, Float64s, Int64s
+from pipeline.report.mission import Fan, Mission, Points, WindowRow
 
 LEVELS = (0.5, 0.9)
 """Shares of the weight that the two envelopes hold."""
@@ -26,13 +26,13 @@ class FanShape:
     direction of the first; radius [2, T]: how many of them the envelopes of `LEVELS` reach
     """
 
-    mean_m: Floats
-    axes_m: Floats
-    angle_rad: Floats
-    radius: Floats
+    mean_m: Float64s
+    axes_m: Float64s
+    angle_rad: Float64s
+    radius: Float64s
 
     @property
-    def spread_m(self) -> Floats:
+    def spread_m(self) -> Float64s:
         """Root mean square distance to the mean [T]."""
         return np.asarray(np.hypot(self.axes_m[:, 0], self.axes_m[:, 1]))
 
@@ -72,7 +72,7 @@ class TruthScore:
     coverage: float
 
 
-def interpolate_truth(truth: Points, time_ns: Ints) -> Floats:
+def interpolate_truth(truth: Points, time_ns: Int64s) -> Float64s:
     """Truth of one agent at `time_ns` [T, 2]; NaN outside it and inside gaps of over three times its median interval."""
     position_m = np.full((len(time_ns), 2), np.nan)
     if len(truth) < 2:
@@ -87,7 +87,7 @@ def interpolate_truth(truth: Points, time_ns: Ints) -> Floats:
     return position_m
 
 
-def truth_errors(fan: Fan, shape: FanShape, truth: Points) -> tuple[Floats, npt.NDArray[np.bool_]]:
+def truth_errors(fan: Fan, shape: FanShape, truth: Points) -> tuple[Float64s, Bools]:
     """Distance from the mean to truth [T] (NaN where truth is silent) and whether the 90 % envelope holds truth [T]."""
     difference = interpolate_truth(truth, fan.time_ns) - shape.mean_m
     turn = np.stack([np.cos(shape.angle_rad), np.sin(shape.angle_rad)])
@@ -105,9 +105,9 @@ class Analysis:
     the origin (NaN where truth is silent). past, future: scores against truth, None without any.
     """
 
-    spread_now_m: Floats
-    spread_end_m: Floats
-    error_now_m: Floats
+    spread_now_m: Float64s
+    spread_end_m: Float64s
+    error_now_m: Float64s
     past: TruthScore | None
     future: TruthScore | None
 
@@ -121,8 +121,8 @@ class Analyser:
         self._now: list[float] = []
         self._end: list[float] = []
         self._error: list[float] = []
-        self._errors: tuple[list[Floats], list[Floats]] = ([], [])
-        self._inside: tuple[list[npt.NDArray[np.bool_]], list[npt.NDArray[np.bool_]]] = ([], [])
+        self._errors: tuple[list[Float64s], list[Float64s]] = ([], [])
+        self._inside: tuple[list[Bools], list[Bools]] = ([], [])
 
     def add(self, fan: Fan, shape: FanShape) -> None:
         """Count one fan."""
@@ -206,7 +206,7 @@ def _detections(row: WindowRow | None) -> int:
     return row.num_detections if row is not None else 0
 
 
-def _largest(values: Floats) -> int | None:
+def _largest(values: Float64s) -> int | None:
     return int(np.nanargmax(values)) if np.isfinite(values).any() else None
 
 

@@ -7,10 +7,11 @@ from html import escape
 
 import numpy as np
 
+from pipeline.arrays import Float64s, Int64s
 from pipeline.report.analysis import Analysis
 from pipeline.report.clock import Clock
 from pipeline.report.lengths import metres
-from pipeline.report.mission import Floats, Ints, Mission, WindowRow
+from pipeline.report.mission import Mission, WindowRow
 
 CHART_WIDTH, LABEL_WIDTH, MARGIN_RIGHT = 1200, 150, 14
 ROW_HEIGHT, TICK_HEIGHT, ROW_GAP = 84, 9, 15
@@ -32,7 +33,7 @@ class TimeAxis:
         """Scale of the axis."""
         return (CHART_WIDTH - LABEL_WIDTH - MARGIN_RIGHT) / ((self._end_ns - self._start_ns) / 1e9)
 
-    def pixels(self, time_ns: Ints | int) -> Floats:
+    def pixels(self, time_ns: Int64s | int) -> Float64s:
         """Horizontal pixels of times."""
         seconds = (np.asarray(time_ns, dtype=np.int64) - self._start_ns) / 1e9
         return np.asarray(LABEL_WIDTH + seconds * self.pixel_per_s, dtype=np.float64)
@@ -52,7 +53,7 @@ class SpreadAxis:
         self._low = math.floor(math.log10(max(low, high * 1e-5, 1e-3)))
         self._high = max(math.ceil(math.log10(high)), self._low + 1)
 
-    def pixels(self, spread_m: Floats) -> Floats:
+    def pixels(self, spread_m: Float64s) -> Float64s:
         """Vertical pixels below the top of a row; values under the axis lie on it."""
         share = (np.log10(np.maximum(spread_m, 10.0**self._low)) - self._low) / (self._high - self._low)
         return np.asarray(ROW_HEIGHT * (1 - np.clip(share, 0, 1)))
@@ -118,7 +119,7 @@ def _chart_row(
     return "".join(parts)
 
 
-def _silent_spans(x: Floats, found: Sequence[int | None]) -> list[tuple[float, float]]:
+def _silent_spans(x: Float64s, found: Sequence[int | None]) -> list[tuple[float, float]]:
     """Where windows have no hypotheses: from halfway to the window before to halfway to the window after."""
     if len(x) == 0:
         return []
@@ -132,7 +133,7 @@ def _silent_spans(x: Floats, found: Sequence[int | None]) -> list[tuple[float, f
     return spans
 
 
-def _broken_line(x: Floats, y: Floats, kind: str) -> str:
+def _broken_line(x: Float64s, y: Float64s, kind: str) -> str:
     """A line that is interrupted where a value is missing or windows are farther apart than usual; lone points as dots."""
     usual = float(np.median(np.diff(x))) if len(x) > 1 else 0.0
     parts: list[str] = []

@@ -6,8 +6,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
+from pipeline.arrays import Float32s, Float64s, Indices
 from pipeline.report.analysis import FanShape
-from pipeline.report.mission import Fan, Floats, Mission
+from pipeline.report.mission import Fan, Mission
 
 QUANTA = 32_000
 """Integers either side of a fan's centre; int16 holds them."""
@@ -56,7 +57,7 @@ def choose_detail(mission: Mission, budget_bytes: float, wanted: Detail) -> Deta
     return replace(detail, num_agents=max(1, min(wanted.num_agents, int(budget_bytes / an_agent))))
 
 
-def choose_vertices(track_m: Floats, origin_index: int, count: int) -> npt.NDArray[np.intp]:
+def choose_vertices(track_m: Float64s, origin_index: int, count: int) -> Indices:
     """At most `count` steps of [K, T, 2] tracks which together follow all of them best, ends and origin included.
 
     Greedy: the step farthest from the chords between its chosen neighbours, over all hypotheses, joins next.
@@ -79,7 +80,7 @@ def choose_vertices(track_m: Floats, origin_index: int, count: int) -> npt.NDArr
     return np.array(chosen)
 
 
-def _measure(track_m: Floats, first: int, last: int, deviation: Floats) -> None:
+def _measure(track_m: Float64s, first: int, last: int, deviation: Float64s) -> None:
     deviation[[first, last]] = 0.0
     if last - first < 2:
         return
@@ -95,10 +96,10 @@ class FanCode:
 
     window: int
     agent: int
-    centre_m: Floats
+    centre_m: Float64s
     scale_m: float
     step: npt.NDArray[np.int16]
-    weight: npt.NDArray[np.float32]
+    weight: Float32s
     hypothesis: npt.NDArray[np.int16]
     summary: npt.NDArray[np.int16]
 

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pipeline.arrays import Float64s
 from pipeline.frames import to_geodetic
-from pipeline.report.mission import Floats
 from pipeline.tables import Frame
 
 DEGREE = 4
@@ -16,10 +16,10 @@ EXPONENTS = tuple((i, j) for i in range(DEGREE + 1) for j in range(DEGREE + 1 - 
 class GeodesyFit:
     """latitude, longitude = polynomials in (x - centre) / half_m, (y - centre) / half_m of the mission frame, degrees."""
 
-    centre_m: Floats
+    centre_m: Float64s
     half_m: float
-    latitude: Floats
-    longitude: Floats
+    latitude: Float64s
+    longitude: Float64s
 
     def as_json(self) -> dict[str, object]:
         """For the page's script."""
@@ -32,7 +32,7 @@ class GeodesyFit:
         }
 
 
-def fit_geodesy(frame: Frame, low_m: Floats, high_m: Floats) -> GeodesyFit | None:
+def fit_geodesy(frame: Frame, low_m: Float64s, high_m: Float64s) -> GeodesyFit | None:
     """A fit over the square around [low_m, high_m] and half as much again.
 
     None where the frame has no datum, or where the fit would be wrong by over a metre (areas of a continent's size).

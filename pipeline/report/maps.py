@@ -8,9 +8,10 @@ from html import escape
 
 import numpy as np
 
+from pipeline.arrays import Float64s
 from pipeline.report.analysis import FanShape
 from pipeline.report.lengths import metres, nice_length
-from pipeline.report.mission import Fan, Floats, Mission, Obstacle
+from pipeline.report.mission import Fan, Mission, Obstacle
 
 MAP_WIDTH, MAP_HEIGHT = 400, 300
 MAX_STATIC_HYPOTHESES = 40
@@ -19,13 +20,13 @@ MAX_STATIC_HYPOTHESES = 40
 class View:
     """From mission metres to the pixels of a small map: equal scales, north up."""
 
-    def __init__(self, position_m: Floats, margin: float = 0.08) -> None:
+    def __init__(self, position_m: Float64s, margin: float = 0.08) -> None:
         low, high = position_m.min(axis=0), position_m.max(axis=0)
         size = np.maximum(high - low, max(float((high - low).max()) * 0.05, 1.0))
         self.pixel_per_m = float(min(MAP_WIDTH / size[0], MAP_HEIGHT / size[1]) * (1 - 2 * margin))
         self._centre_m = (low + high) / 2
 
-    def pixels(self, position_m: Floats) -> Floats:
+    def pixels(self, position_m: Float64s) -> Float64s:
         """[..., 2] metres to [..., 2] pixels."""
         shifted = (np.asarray(position_m, dtype=np.float64) - self._centre_m) * self.pixel_per_m
         return np.asarray(shifted * (1, -1) + (MAP_WIDTH / 2, MAP_HEIGHT / 2))
@@ -59,7 +60,7 @@ def moment_map(mission: Mission, fan: Fan, shape: FanShape, steps: tuple[int, in
     return f"{opening}{''.join(parts)}</svg>"
 
 
-def _hypotheses(pixels: Floats, weight: Floats, now: int) -> list[str]:
+def _hypotheses(pixels: Float64s, weight: Float64s, now: int) -> list[str]:
     """The heaviest hypotheses [K, T, 2], stronger where heavier; step `now` is the origin."""
     heaviest = np.sort(np.argsort(-weight, kind="stable")[:MAX_STATIC_HYPOTHESES])
     base = min(0.8, max(0.16, 2.4 / math.sqrt(len(heaviest))))
@@ -70,7 +71,7 @@ def _hypotheses(pixels: Floats, weight: Floats, now: int) -> list[str]:
     return parts
 
 
-def _dots(pixels: Floats, age: Floats) -> list[str]:
+def _dots(pixels: Float64s, age: Float64s) -> list[str]:
     """Detections of [N, 2] pixels, fading with age [N] (negative: after the origin); of those that cover each other one."""
     parts: list[str] = []
     latest: tuple[float, float, bool] | None = None
@@ -101,7 +102,7 @@ def scale_bar(pixel_per_m: float) -> str:
     )
 
 
-def _line(pixels: Floats, kind: str, opacity: float | None = None) -> str:
+def _line(pixels: Float64s, kind: str, opacity: float | None = None) -> str:
     if len(pixels) < 2:
         return ""
     kept = _simplify(pixels)
@@ -110,7 +111,7 @@ def _line(pixels: Floats, kind: str, opacity: float | None = None) -> str:
     return f'<polyline class="{kind}" points="{points}"{faded}/>'
 
 
-def _simplify(pixels: Floats, tolerance: float = 0.4) -> Floats:
+def _simplify(pixels: Float64s, tolerance: float = 0.4) -> Float64s:
     """Without the points that lie closer than `tolerance` pixels to the chord (Douglas and Peucker, 1973)."""
     keep = np.zeros(len(pixels), dtype=bool)
     keep[[0, -1]] = True

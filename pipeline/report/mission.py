@@ -12,17 +12,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 
 from cadence.errors import InputError
+from pipeline.arrays import Float32s, Float64s, Int64s
 from pipeline.manifest import hash_file, read_manifest
 from pipeline.report.origins import Origins, origins_of, with_likeliest
 from pipeline.results import AgentHypotheses, MissionHypotheses, WindowHypotheses, read_hypothesis_tables
 from pipeline.tables import Frame, read_table
 
-Floats = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
 JsonDict = dict[str, Any]
 
 UNKNOWN_AGENT = "unknown"
@@ -39,9 +37,9 @@ class Points:
     time_ns [N], owner [N] index into the names that belong to it (-1: unknown), position_m [N, 2]
     """
 
-    time_ns: Ints
-    owner: Ints
-    position_m: Floats
+    time_ns: Int64s
+    owner: Int64s
+    position_m: Float64s
 
     def of(self, owner: int) -> "Points":
         """The points of one owner."""
@@ -71,12 +69,12 @@ class Fan:
     origin_ns: int
     step_ns: int
     origin_index: int
-    weight: Floats
-    datum_m: Floats
-    offset_m: npt.NDArray[np.float32]
+    weight: Float64s
+    datum_m: Float64s
+    offset_m: Float32s
 
     @property
-    def time_ns(self) -> Ints:
+    def time_ns(self) -> Int64s:
         """Times of the steps [T]."""
         steps = np.arange(self.offset_m.shape[1], dtype=np.int64) - self.origin_index
         return self.origin_ns + steps * self.step_ns
@@ -101,7 +99,7 @@ class Obstacle:
     """Rings [N, 2] of a polygon (outline first, then holes); a circle has no rings but a radius."""
 
     name: str
-    rings_m: tuple[Floats, ...]
+    rings_m: tuple[Float64s, ...]
     centre_m: tuple[float, float] | None = None
     radius_m: float = 0.0
 
@@ -243,10 +241,10 @@ def _natural(name: str) -> tuple[list[str | int], str]:
     return [int(part) if index % 2 else part for index, part in enumerate(parts)], name
 
 
-def _index(column: pa.ChunkedArray, names: tuple[str, ...]) -> Ints:
+def _index(column: pa.ChunkedArray, names: tuple[str, ...]) -> Int64s:
     order = {name: index for index, name in enumerate(names)}
     encoded = column.combine_chunks().dictionary_encode()
-    lookup: Ints = np.array([*(order[name] for name in encoded.dictionary.to_pylist()), -1], dtype=np.int64)
+    lookup: Int64s = np.array([*(order[name] for name in encoded.dictionary.to_pylist()), -1], dtype=np.int64)
     return np.asarray(lookup[encoded.indices.fill_null(len(lookup) - 1).to_numpy(zero_copy_only=False)])
 
 

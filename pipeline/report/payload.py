@@ -12,9 +12,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from pipeline.arrays import Column, Float64s
 from pipeline.report.fans import FanCode
 from pipeline.report.geodesy import GeodesyFit
-from pipeline.report.mission import Floats, Mission, Points, WindowRow
+from pipeline.report.mission import Mission, Points, WindowRow
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,7 +102,7 @@ def _fullest(codes: Sequence[FanCode], windows: Sequence[int]) -> int:
     return max(range(len(windows)), key=lambda place: (count[windows[place]], -abs(place - middle)), default=0)
 
 
-def _centre(mission: Mission) -> Floats:
+def _centre(mission: Mission) -> Float64s:
     points = [found.position_m for found in (mission.detections, mission.truth) if found is not None and len(found)]
     if not points:
         return np.round(mission.fans[0].datum_m) if mission.fans else np.zeros(2)
@@ -129,7 +130,7 @@ def _thin(points: Points | None, limit: int) -> tuple[Points | None, int]:
     return Points(points.time_ns[chosen], points.owner[chosen], points.position_m[chosen]), len(chosen)
 
 
-def _encode_points(mission: Mission, points: Points | None, origin_m: Floats) -> dict[str, Any] | None:
+def _encode_points(mission: Mission, points: Points | None, origin_m: Float64s) -> dict[str, Any] | None:
     if points is None:
         return None
     return {
@@ -139,7 +140,7 @@ def _encode_points(mission: Mission, points: Points | None, origin_m: Floats) ->
     }
 
 
-def _encode_fans(codes: Sequence[FanCode], windows: Sequence[int], agents: Sequence[int], origin_m: Floats) -> dict[str, Any]:
+def _encode_fans(codes: Sequence[FanCode], windows: Sequence[int], agents: Sequence[int], origin_m: Float64s) -> dict[str, Any]:
     window_place = {window: index for index, window in enumerate(windows)}
     agent_place = {agent: index for index, agent in enumerate(agents)}
     return {
@@ -160,5 +161,5 @@ def _base64(values: npt.ArrayLike, kind: str) -> str:
     return base64.b64encode(np.ascontiguousarray(np.asarray(values).astype(kind)).tobytes()).decode("ascii")
 
 
-def _joined(arrays: Sequence[npt.NDArray[Any]], kind: str) -> str:
+def _joined(arrays: Sequence[Column], kind: str) -> str:
     return _base64(np.concatenate([np.empty(0), *(array.ravel() for array in arrays)]), kind)

@@ -10,13 +10,14 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
+from pipeline.arrays import Float64s
 from pipeline.manifest import JsonObject, StageResult, run_stage
 from pipeline.progress import Progress
 from pipeline.report.analysis import Analyser, Analysis, Moment, choose_moments, shape_of, shown_share
 from pipeline.report.charts import MAX_TICKS
 from pipeline.report.fans import Detail, FanCode, choose_detail, encode_fan
 from pipeline.report.geodesy import fit_geodesy
-from pipeline.report.mission import Floats, Mission, load_mission, mission_inputs
+from pipeline.report.mission import Mission, load_mission, mission_inputs
 from pipeline.report.page import write_page
 from pipeline.report.payload import Payload, build_payload
 
@@ -136,7 +137,7 @@ def _shown_agents(mission: Mission, count: int) -> list[int]:
     return sorted(ranked[:count])
 
 
-def _extent(mission: Mission, codes: list[FanCode]) -> tuple[Floats, Floats]:
+def _extent(mission: Mission, codes: list[FanCode]) -> tuple[Float64s, Float64s]:
     corners = [
         points.position_m for points in (mission.detections, mission.truth, mission.poses) if points is not None and len(points)
     ]

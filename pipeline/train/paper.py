@@ -5,10 +5,9 @@ import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
@@ -19,13 +18,14 @@ from cadence.network.trajectory import TrajectoryNetwork, TrajectoryNetworkConfi
 from cadence.training.absolute import AbsoluteWindows, absolute_loss, forecast_rows, join_absolute
 from cadence.training.loop import Loss, Trainer
 from cadence.worlds.patrol import PatrolConfig, simulate_patrol
-from cadence.worlds.recordings import NUM_STEPS, Int64s, Recordings, cut_windows
+from cadence.worlds.recordings import NUM_STEPS, Recordings, cut_windows
+from pipeline.arrays import Column, Float64s, Int64s
 from pipeline.episodes.pool import EpisodeSource, load_pool
 from pipeline.manifest import StageResult
 from pipeline.progress import Progress
 from pipeline.train.missions import TrainingMission, mission_of_episode, missions_of_logs
 from pipeline.train.run import TrainingRun, run_training
-from pipeline.windows import Float64s, Grid, MissionWindows, build_windows, truth_on_grid
+from pipeline.windows import Grid, MissionWindows, build_windows, truth_on_grid
 
 if TYPE_CHECKING:
     from pipeline.train.stage import TrainConfig
@@ -347,7 +347,7 @@ def _filled(truth_m: Tensor, is_known: Tensor) -> Tensor:
     return truth_m.gather(-2, index[..., None].expand(truth_m.shape))
 
 
-def _map_limits(training: AbsoluteTraining, places_m: Sequence[npt.NDArray[Any]]) -> tuple[tuple[float, float], float]:
+def _map_limits(training: AbsoluteTraining, places_m: Sequence[Column]) -> tuple[tuple[float, float], float]:
     """Centre and half side of the square that holds all places [2, N], with a little room; what is configured is kept."""
     low = np.min([place.min(axis=1) for place in places_m], axis=0).astype(np.float64)
     high = np.max([place.max(axis=1) for place in places_m], axis=0).astype(np.float64)
