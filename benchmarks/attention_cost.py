@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from cadence.diffusion.scene import SceneModel
-from cadence.worlds.recordings import ForecastWindows, cut_windows
+from cadence.recordings import ForecastWindows, cut_windows
 from cadence.worlds.rendezvous import RendezvousConfig, simulate_rendezvous_batch
 from pipeline.checkpoints import find_checkpoint
 from pipeline.estimators.scene import load_scene

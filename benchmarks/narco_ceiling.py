@@ -26,8 +26,8 @@ from table1_page import LATE, MINUTES, NAMES, measure_cells
 from cadence.bank.rows import active_rows, scatter_hypotheses
 from cadence.diffusion.scene import SceneSampling
 from cadence.errors import CadenceError
+from cadence.recordings import Recordings
 from cadence.types import Context, Detections, HypothesisSet, WindowBatch
-from cadence.worlds.recordings import Recordings
 from pipeline.checkpoints import checkpoint_hash, find_checkpoint
 from pipeline.episodes.recordings import RecordingsConfig, load_recordings
 from pipeline.forecast.forecasters import FORECAST_RIVALS, Samplings, Unguided, load_forecaster

@@ -29,10 +29,10 @@ from cadence.arrays import Float64s, Int64s
 from cadence.association.associate import associate
 from cadence.association.types import AssociationConfig
 from cadence.diffusion.scene import SceneModel, SceneSampling
+from cadence.recordings import ForecastWindows, choose_windows, cut_windows
 from cadence.resampling import systematic
 from cadence.types import Detections, HypothesisSet, WindowBatch
 from cadence.worlds.joint import JointRecordings, meets
-from cadence.worlds.recordings import ForecastWindows, choose_windows, cut_windows
 from cadence.worlds.rendezvous import RendezvousConfig, simulate_rendezvous, simulate_rendezvous_batch
 from cadence.worlds.rendezvous_map import GOALS_M, SITES_M
 from pipeline.checkpoints import checkpoint_hash, find_checkpoint

@@ -26,9 +26,9 @@ from cadence.diffusion.scene_frame import SceneConfig
 from cadence.errors import InputError
 from cadence.metrics import Interval
 from cadence.network.scene import SceneNetwork
+from cadence.recordings import Recordings
 from cadence.training.loop import OptimiserConfig
 from cadence.worlds.prison_map import SIDE, prison_map
-from cadence.worlds.recordings import Recordings
 from pipeline.checkpoints import checkpoint_hash, read_info
 from pipeline.episodes.pool import EpisodePool, EpisodeSource
 from pipeline.episodes.recordings import RecordingsConfig, load_recordings, read_recordings

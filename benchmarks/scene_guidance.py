@@ -43,8 +43,8 @@ from scene_samplers import (
 from cadence.constraints.checker import states_in_collision
 from cadence.diffusion.scene import SceneModel, SceneSampling
 from cadence.metrics import Interval, bootstrap_ratio
+from cadence.recordings import ForecastWindows, Recordings, choose_windows
 from cadence.worlds import prison_map
-from cadence.worlds.recordings import ForecastWindows, Recordings, choose_windows
 from pipeline.forecast.scores import EpisodeScores
 from pipeline.manifest import write_atomic
 

@@ -24,9 +24,9 @@ from cadence.constraints.obstacles import Obstacles
 from cadence.diffusion.scene import SceneModel, SceneSampling
 from cadence.errors import CadenceError
 from cadence.metrics import Interval, bootstrap_ratio
+from cadence.recordings import ForecastWindows, Recordings, choose_windows, cut_windows
 from cadence.types import HypothesisSet
 from cadence.worlds import prison_map
-from cadence.worlds.recordings import ForecastWindows, Recordings, choose_windows, cut_windows
 from pipeline.checkpoints import checkpoint_hash, find_checkpoint
 from pipeline.episodes.recordings import RecordingsConfig, load_recordings
 from pipeline.estimators.scene import load_scene

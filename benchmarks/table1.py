@@ -33,7 +33,7 @@ from table1_page import MIXTURES, NAMES, Evaluated, Found, page, record
 from cadence.diffusion.absolute import AbsoluteSampling
 from cadence.diffusion.scene import SceneSampling
 from cadence.errors import CadenceError, InputError
-from cadence.worlds.recordings import Recordings
+from cadence.recordings import Recordings
 from pipeline.checkpoints import checkpoint_hash, find_checkpoint, read_info, windows_seen
 from pipeline.config import config_as_dict
 from pipeline.episodes.recordings import RecordingsConfig, load_recordings

@@ -25,7 +25,7 @@ from table1 import EVALUATION_SEED
 from table1_page import LATE, MINUTES, NAMES, measure_cells, worst
 
 from cadence.errors import CadenceError
-from cadence.worlds.recordings import Recordings
+from cadence.recordings import Recordings
 from pipeline.checkpoints import checkpoint_hash, read_info, windows_seen
 from pipeline.config import stage_config
 from pipeline.episodes.pool import EpisodePool, EpisodeSource

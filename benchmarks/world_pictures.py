@@ -14,8 +14,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Polygon
 from PIL import Image
 
+from cadence.recordings import Recordings
 from cadence.worlds import narco, ocean, prison, prison_map, rendezvous, rendezvous_map
-from cadence.worlds.recordings import Recordings
 
 NUM_EPISODES = 100
 _INK, _SEEN, _CAUGHT, _GOAL, _VIA = "#1d2733", "#e8a33d", "#c0392b", "#2e7d32", "#6a4c93"

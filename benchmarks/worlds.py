@@ -14,10 +14,10 @@ from pathlib import Path
 
 import numpy as np
 
+from cadence.recordings import Recordings
 from cadence.worlds import narco, prison, prison_map
 from cadence.worlds.draws import Draws
 from cadence.worlds.prison_fugitive import Fugitives, Sight, stride
-from cadence.worlds.recordings import Recordings
 from cadence.worlds.statistics import EpisodeStatistics, compare, episode_statistics, site_difference
 from pipeline.episodes.recordings import RecordingsConfig, load_recordings
 from pipeline.progress import Progress

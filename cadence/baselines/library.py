@@ -16,9 +16,9 @@ import torch
 
 from cadence.arrays import Float64s, Int64s
 from cadence.bank.rows import active_rows, scatter_hypotheses
+from cadence.recordings import Recordings
 from cadence.resampling import candidates_at, systematic
 from cadence.types import Context, Detections, HypothesisSet, WindowBatch
-from cadence.worlds.recordings import Recordings
 
 _REACH = 3.5
 """Standard deviations of the last detection's kernel beyond which a state is not looked at."""

@@ -18,9 +18,9 @@ from scipy.special import ndtri
 
 from cadence.arrays import Float64s, Int64s
 from cadence.bank.rows import active_rows, scatter_hypotheses
+from cadence.recordings import Recordings
 from cadence.resampling import systematic
 from cadence.types import Context, Detections, HypothesisSet, WindowBatch
-from cadence.worlds.recordings import Recordings
 
 _BLOCK = 8
 """Steps over which speed and heading are measured: paths on a grid waver from step to step."""

@@ -13,8 +13,8 @@ import torch
 
 from cadence.arrays import Int64s
 from cadence.baselines.kalman import ConstantVelocityKalman, OrnsteinUhlenbeckKalman
+from cadence.recordings import Recordings
 from cadence.types import Context, Detections, HypothesisSet, WindowBatch
-from cadence.worlds.recordings import Recordings
 
 _MAX_STRETCHES = 400
 

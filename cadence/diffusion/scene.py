@@ -25,8 +25,8 @@ from cadence.errors import ConfigError
 from cadence.network.attention import MAX_AGENTS, Team
 from cadence.network.frozen import FrozenScene
 from cadence.network.scene import Pieces, SceneNetwork
+from cadence.recordings import NUM_STEPS
 from cadence.types import Context, Detections, HypothesisSet, WindowBatch
-from cadence.worlds.recordings import NUM_STEPS
 
 _START, _END = MAX_ANGLE - 0.04, 0.08
 """Noise levels that DPM-Solver++ starts from and takes its last step at; evenly spaced in log SNR between them, six steps agree

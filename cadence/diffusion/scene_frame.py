@@ -12,8 +12,8 @@ from torch import Tensor
 
 from cadence.arrays import Int64s
 from cadence.network.scene import Pieces, SceneInputs, SceneNetwork, SceneNetworkConfig, octaves
+from cadence.recordings import NUM_STEPS, Recordings
 from cadence.types import Context, Detections, WindowBatch
-from cadence.worlds.recordings import NUM_STEPS, Recordings
 
 _NUM_OCTAVES = 5
 _TRACKER_LAGS = (0, 4, 8, 16, 32, 63)

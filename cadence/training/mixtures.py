@@ -8,7 +8,7 @@ from torch import Tensor
 from cadence.baselines.grammi import GrammiNetwork
 from cadence.baselines.mixture import HistoryConfig, MixtureFrame, MixtureInputs, mixture_inputs
 from cadence.baselines.vrnn import VrnnNetwork
-from cadence.worlds.recordings import ForecastWindows
+from cadence.recordings import ForecastWindows
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,8 +14,8 @@ from cadence.diffusion.scene_team import agent_rows, shared_detections
 from cadence.diffusion.schedule import MAX_ANGLE, clean_from
 from cadence.network.attention import Team
 from cadence.network.scene import Pieces, SceneInputs, SceneNetwork
+from cadence.recordings import NUM_STEPS, Recordings, cut_windows
 from cadence.types import Context
-from cadence.worlds.recordings import NUM_STEPS, Recordings, cut_windows
 
 _LEAST_ANGLE = 0.01
 _LOCAL_SCALE = 0.05

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from cadence.arrays import Bools, Float32s, Float64s, Floats, Int64s
-from cadence.worlds.recordings import Recordings
+from cadence.recordings import Recordings
 
 MEETING_RADIUS_M = 600.0
 """Agents that are so near to a site at one step are there together: four steps' way, a fifth of the distance of sites."""

@@ -24,12 +24,12 @@ import numpy as np
 import shapely
 
 from cadence.arrays import Bools, Float32s, Float64s, Int64s
+from cadence.recordings import Recordings
 from cadence.worlds.detection import detect
 from cadence.worlds.draws import Draws
 from cadence.worlds.episode import Episode, SensorReports
 from cadence.worlds.ocean import CELL, SIZE, Ocean, eastern_pacific
 from cadence.worlds.pursuit import AIRPLANE, VESSEL, MoverKind, Pursuit, is_working
-from cadence.worlds.recordings import Recordings
 from cadence.worlds.terrain import Terrain
 
 START = np.array([4000.0, 100.0])

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cadence.arrays import Bools, Float64s, Int64s
+from cadence.recordings import Recordings
 from cadence.worlds.detection import detect
 from cadence.worlds.draws import Draws
 from cadence.worlds.episode import Episode, SensorReports
@@ -39,7 +40,6 @@ from cadence.worlds.prison_map import (
 )
 from cadence.worlds.prison_search import Search
 from cadence.worlds.pursuit import HELICOPTER, PARTY, MoverKind, is_working
-from cadence.worlds.recordings import Recordings
 from cadence.worlds.terrain import Terrain
 
 STEP_S = 60.0

@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cadence.arrays import Bools, Float64s, Int64s
+from cadence.recordings import Recordings
 from cadence.worlds.draws import Draws
 from cadence.worlds.episode import Episode, SensorReports
 from cadence.worlds.joint import JointRecordings
-from cadence.worlds.recordings import Recordings
 from cadence.worlds.rendezvous_map import (
     GOALS_M,
     MAX_SHIFT_M,

@@ -6,7 +6,7 @@ import numpy as np
 from scipy import stats
 
 from cadence.arrays import Float64s, Int64s
-from cadence.worlds.recordings import Recordings
+from cadence.recordings import Recordings
 
 MEASURES = ("length", "rate", "gap", "stride")
 """Names of the samples that two sets are compared by."""

@@ -12,7 +12,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from cadence.errors import InputError
-from cadence.worlds.recordings import Recordings
+from cadence.recordings import Recordings
 from pipeline.arrays import Float64s, Int64s
 from pipeline.extract.obstacle_sources import OBSTACLES_NAME
 from pipeline.extract.stage import ExtractConfig, write_tables

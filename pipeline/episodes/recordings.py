@@ -16,7 +16,7 @@ import numpy as np
 
 from cadence.constraints.obstacles import Obstacles
 from cadence.errors import CadenceError, DeviceError, InputError
-from cadence.worlds.recordings import Recordings
+from cadence.recordings import Recordings
 from pipeline.config import config_as_dict
 from pipeline.episodes.recorded_logs import Gridding, LogEpisodes, read_log_episodes
 from pipeline.extract.obstacle_sources import as_obstacles

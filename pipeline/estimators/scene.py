@@ -8,8 +8,8 @@ import torch
 from cadence.diffusion.scene import SceneModel, SceneSampling
 from cadence.diffusion.scene_frame import SceneConfig
 from cadence.errors import ConfigError
+from cadence.recordings import NUM_STEPS
 from cadence.types import Context
-from cadence.worlds.recordings import NUM_STEPS
 from pipeline.checkpoints import load_weights, network_config, read_info
 from pipeline.windows import GridConfig, MissionWindows
 

@@ -13,8 +13,8 @@ from cadence.constraints.obstacles import Obstacles
 from cadence.diffusion.absolute import AbsoluteSampling
 from cadence.diffusion.scene import SceneSampling
 from cadence.errors import ConfigError
+from cadence.recordings import Recordings
 from cadence.types import Context, Estimator
-from cadence.worlds.recordings import Recordings
 from pipeline.checkpoints import find_checkpoint, read_info
 from pipeline.estimators.paper import load_absolute
 from pipeline.estimators.scene import load_scene

@@ -24,8 +24,8 @@ from cadence.constraints.obstacles import Obstacles
 from cadence.diffusion.absolute import AbsoluteSampling
 from cadence.diffusion.scene import SceneSampling
 from cadence.errors import ConfigError, InputError
+from cadence.recordings import ForecastWindows, Recordings, choose_windows, cut_windows
 from cadence.types import Context, Detections, Estimator, HypothesisSet, WindowBatch
-from cadence.worlds.recordings import ForecastWindows, Recordings, choose_windows, cut_windows
 from pipeline.checkpoints import checkpoint_hash, find_checkpoint
 from pipeline.config import config_as_dict
 from pipeline.episodes.recordings import RecordingsConfig, RecordingSet, load_recordings

@@ -15,10 +15,10 @@ from cadence.bank.rows import active_rows
 from cadence.diffusion.absolute import AbsoluteConfig, detection_rows
 from cadence.errors import ConfigError, InputError
 from cadence.network.trajectory import TrajectoryNetwork, TrajectoryNetworkConfig
+from cadence.recordings import NUM_STEPS, Recordings, cut_windows
 from cadence.training.absolute import AbsoluteWindows, absolute_loss, forecast_rows, join_absolute
 from cadence.training.loop import Loss, Trainer
 from cadence.worlds.patrol import PatrolConfig, simulate_patrol
-from cadence.worlds.recordings import NUM_STEPS, Recordings, cut_windows
 from pipeline.arrays import Column, Float64s, Int64s
 from pipeline.episodes.pool import EpisodeSource, load_pool
 from pipeline.manifest import StageResult

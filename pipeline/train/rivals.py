@@ -18,9 +18,9 @@ from cadence.baselines.grammi import GrammiNetwork, GrammiNetworkConfig
 from cadence.baselines.mixture import HistoryConfig, MixtureFrame, MixtureModel
 from cadence.baselines.vrnn import VrnnNetwork, VrnnNetworkConfig
 from cadence.errors import ConfigError
+from cadence.recordings import Recordings, cut_windows
 from cadence.training.loop import Loss, Trainer
 from cadence.training.mixtures import MixtureWindows, grammi_loss, hidden_goals, mixture_windows, vrnn_loss
-from cadence.worlds.recordings import Recordings, cut_windows
 from pipeline.checkpoints import CheckpointInfo, load_weights, network_config, read_info, save_checkpoint
 from pipeline.episodes.recordings import RecordingsConfig, load_recordings
 from pipeline.manifest import StageResult, write_atomic

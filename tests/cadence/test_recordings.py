@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from cadence.worlds.recordings import NUM_STEPS, Recordings, choose_windows, cut_windows
+from cadence.recordings import NUM_STEPS, Recordings, choose_windows, cut_windows
 
 
 def recordings(seed: int = 0, lengths: tuple[int, ...] = (40, 7, 200)) -> Recordings:

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from cadence.baselines.library import PLAIN, SHIFTED, LibraryConfig, TrajectoryLibrary, _draw, _flattened, spaced_lags
+from cadence.recordings import ForecastWindows, Recordings, choose_windows, cut_windows
 from cadence.types import Estimator
-from cadence.worlds.recordings import ForecastWindows, Recordings, choose_windows, cut_windows
 
 STEP_M = 100.0
 SHARP = dataclasses.replace(LibraryConfig(), sigma=1.0, sigma_per_lag=0.02, stride=1)

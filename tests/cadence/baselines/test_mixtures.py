@@ -23,9 +23,9 @@ from cadence.baselines.recurrence import run_recurrence
 from cadence.baselines.vrnn import VrnnNetwork, VrnnNetworkConfig
 from cadence.errors import ConfigError
 from cadence.network.encoder import DetectionEncoder
+from cadence.recordings import Recordings, choose_windows, cut_windows
 from cadence.training.mixtures import grammi_loss, hidden_goals, mixture_windows, vrnn_loss
 from cadence.types import Context
-from cadence.worlds.recordings import Recordings, choose_windows, cut_windows
 
 HISTORY = HistoryConfig(max_detections=20, tracker_steps=8)
 FRAME = MixtureFrame(60.0, (500.0, 500.0), 500.0, 100.0, 200.0)

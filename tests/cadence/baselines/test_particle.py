@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from cadence.baselines.particle import ParticleFilter, RandomTurn, _Particles
+from cadence.recordings import ForecastWindows, Recordings, choose_windows, cut_windows
 from cadence.types import Estimator
-from cadence.worlds.recordings import ForecastWindows, Recordings, choose_windows, cut_windows
 
 STEADY = RandomTurn(60.0, np.array([100.0]), 0.0, 0.0, 1.0, 0.01, 0.0)
 

@@ -6,8 +6,8 @@ import torch
 
 from cadence.baselines.kalman import ConstantVelocityKalman, OrnsteinUhlenbeckKalman
 from cadence.baselines.recorded_kalman import RecordedKalman, detection_stretches, thin, waver
+from cadence.recordings import Recordings, choose_windows, cut_windows
 from cadence.types import Estimator
-from cadence.worlds.recordings import Recordings, choose_windows, cut_windows
 
 RIVALS = [ConstantVelocityKalman(), OrnsteinUhlenbeckKalman()]
 

@@ -13,10 +13,10 @@ from cadence.diffusion.scene import SceneModel, SceneSampling
 from cadence.diffusion.scene_frame import SceneConfig, future_of, recorded_track, scene_inputs, to_pieces, to_track
 from cadence.errors import ConfigError
 from cadence.network.scene import SceneNetworkConfig
+from cadence.recordings import ForecastWindows, Recordings, cut_windows
 from cadence.training import scene as training
 from cadence.training.scene import Dropout, SceneWindows, diffusion_loss, energy_loss, few_step_sample, scene_windows
 from cadence.types import Context
-from cadence.worlds.recordings import ForecastWindows, Recordings, cut_windows
 
 SMALL = SceneNetworkConfig(
     width=16, multipliers=(1, 2), encoder_size=8, code_size=16, level_size=8, max_detections=12, map_cells=8, map_channels=2

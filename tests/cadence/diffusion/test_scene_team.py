@@ -13,9 +13,9 @@ from cadence.errors import ConfigError
 from cadence.network.attention import MAX_AGENTS
 from cadence.network.frozen import FrozenScene
 from cadence.network.scene import SceneNetworkConfig
+from cadence.recordings import ForecastWindows, Recordings, cut_windows
 from cadence.training.scene import Dropout, diffusion_loss, energy_loss, scene_windows
 from cadence.types import Context, Detections, WindowBatch
-from cadence.worlds.recordings import ForecastWindows, Recordings, cut_windows
 
 SMALL = SceneNetworkConfig(
     width=16, multipliers=(1, 2), encoder_size=8, code_size=16, level_size=8, max_detections=12, map_cells=8, map_channels=2

@@ -6,13 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from cadence.recordings import Recordings
 from cadence.worlds.block_route import BlockPlanner
 from cadence.worlds.draws import Draws
 from cadence.worlds.perlin import enlarge_twice, fractal, octave
 from cadence.worlds.prison import PrisonConfig, simulate_prison, simulate_prison_batch
 from cadence.worlds.prison_fugitive import Fugitives, Sight, nearest_forest, stride, turn_from
 from cadence.worlds.prison_map import CELL_M, HIDDEN_CAMERAS, KNOWN_SITES, SEEN_CAMERAS, SIDE, UNKNOWN_SITES, prison_map
-from cadence.worlds.recordings import Recordings
 from cadence.worlds.statistics import EpisodeStatistics, compare, episode_statistics, site_difference
 
 KEPT = Path(__file__).parent / "prison_reference.json"

@@ -10,7 +10,7 @@ from fixtures.small_logs import Row, detection, pose, time_ns, write_log
 from mcap.writer import Writer
 
 from cadence.errors import ConfigError, InputError
-from cadence.worlds.recordings import Recordings
+from cadence.recordings import Recordings
 from pipeline.config import read_config
 from pipeline.episodes import recordings as recordings_module
 from pipeline.episodes.recordings import RecordingsConfig, load_recordings, read_recordings, save_recordings

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from cadence.errors import ConfigError
-from cadence.worlds.recordings import Recordings
+from cadence.recordings import Recordings
 from pipeline.episodes.pool import EpisodePool, EpisodeSource
 
 

@@ -11,10 +11,10 @@ from fixtures.killed_training import Killed, Killer
 from cadence.diffusion.absolute import AbsoluteConfig, AbsoluteSampling
 from cadence.errors import ConfigError, InputError
 from cadence.network.trajectory import TrajectoryNetwork, TrajectoryNetworkConfig
+from cadence.recordings import Recordings, cut_windows
 from cadence.training.absolute import forecast_rows
 from cadence.training.loop import OptimiserConfig
 from cadence.worlds.patrol import PatrolConfig, simulate_patrol
-from cadence.worlds.recordings import Recordings, cut_windows
 from pipeline.checkpoints import CheckpointInfo, read_info, save_checkpoint
 from pipeline.config import config_as_dict, read_config
 from pipeline.episodes.pool import EpisodeSource

@@ -12,8 +12,8 @@ from cadence.baselines.grammi import GrammiNetworkConfig
 from cadence.baselines.mixture import HistoryConfig
 from cadence.baselines.vrnn import VrnnNetworkConfig
 from cadence.errors import ConfigError
+from cadence.recordings import Recordings, choose_windows, cut_windows
 from cadence.training.loop import OptimiserConfig
-from cadence.worlds.recordings import Recordings, choose_windows, cut_windows
 from pipeline.checkpoints import read_info
 from pipeline.config import read_config
 from pipeline.episodes.recordings import RecordingsConfig, save_recordings

@@ -14,8 +14,8 @@ from cadence.diffusion.scene import SceneSampling
 from cadence.diffusion.scene_frame import SceneConfig
 from cadence.errors import ConfigError, InputError
 from cadence.network.scene import SceneNetworkConfig
+from cadence.recordings import Recordings, cut_windows
 from cadence.training.loop import OptimiserConfig
-from cadence.worlds.recordings import Recordings, cut_windows
 from pipeline.checkpoints import read_info
 from pipeline.episodes.pool import EpisodeSource
 from pipeline.episodes.recordings import RecordingsConfig, save_recordings
