@@ -4,8 +4,6 @@ import base64
 import hashlib
 import json
 import re
-import shutil
-import subprocess
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -13,7 +11,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 import pytest
-from fixtures.mission import GEOREFERENCED, build_mission
+from fixtures.mission import GEOREFERENCED, build_mission, rename_agents
 
 from cadence.errors import InputError
 from pipeline.progress import Progress
@@ -86,16 +84,6 @@ def built(folder: Path, **options) -> Path:
     return build_mission(folder, **options)
 
 
-def rename(directory: Path, names: dict[str, str]) -> None:
-    """Other agent ids in every table."""
-    for name in ("detections", "truth", "hypotheses", "windows"):
-        table, frame = read_table(directory / f"{name}.parquet", name)
-        column = table.schema.get_field_index("agent_id")
-        field = table.schema.field(column)
-        values = [names.get(value, value) for value in table["agent_id"].to_pylist()]
-        write_table(table.set_column(column, field, pa.array(values, pa.string())), directory / f"{name}.parquet", name, frame)
-
-
 @pytest.fixture
 def mission(tmp_path: Path) -> Path:
     return build_mission(tmp_path)
@@ -133,7 +121,7 @@ def test_same_input_same_bytes_and_skipped_until_something_changes(mission: Path
 
 
 def test_what_a_log_names_itself_stays_text(mission: Path) -> None:
-    rename(mission, dict(zip(("T0", "T1"), HOSTILE, strict=True)))
+    rename_agents(mission, dict(zip(("T0", "T1"), HOSTILE, strict=True)))
     catalogue = json.loads((mission / "catalogue.json").read_text())
     catalogue["path"] = f"/logs/{HOSTILE[0].replace('/', '')}.mcap"
     catalogue["channels"][0]["topic"] = HOSTILE[1]
@@ -257,7 +245,7 @@ def test_detections_without_an_agent_are_counted_and_drawn(mission: Path) -> Non
 
 
 def test_detections_of_unknown_origin_belong_to_the_agent_that_infer_made_of_them(mission: Path) -> None:
-    rename(mission, {"T0": UNKNOWN_AGENT})
+    rename_agents(mission, {"T0": UNKNOWN_AGENT})
     table, frame = read_table(mission / "detections.parquet", "detections")
     column = table.schema.get_field_index("agent_id")
     ids = pa.array([None if value == UNKNOWN_AGENT else value for value in table["agent_id"].to_pylist()], pa.string())
@@ -319,23 +307,3 @@ def test_scores_of_evaluate_are_shown_unless_they_are_of_other_hypotheses(missio
 def test_config_refuses_nonsense() -> None:
     with pytest.raises(ValueError, match="max_megabytes"):
         ReportConfig(max_megabytes=0)
-
-
-@pytest.mark.skipif(shutil.which("chromium") is None, reason="no chromium to run the page's script in")
-def test_the_script_runs_in_a_browser(mission: Path, tmp_path: Path) -> None:
-    rename(mission, {"T0": HOSTILE[0]})
-    make(mission)
-    command = ["chromium", "--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-background-networking"]
-    command += ["--disable-component-update", "--disable-sync", f"--user-data-dir={tmp_path / 'profile'}"]
-    command += ["--enable-logging=stderr", "--virtual-time-budget=2000", "--dump-dom", (mission / "report.html").as_uri()]
-    try:
-        shown = subprocess.run(command, capture_output=True, text=True, timeout=80, check=False)
-    except subprocess.TimeoutExpired:
-        pytest.skip("chromium takes too long here")
-    if shown.returncode != 0:
-        pytest.skip("chromium does not start here")
-    assert "CONSOLE" not in shown.stderr
-    page = Page(shown.stdout)
-    assert "img" not in page.tags
-    assert "2023-11-14 22:14:40 UTC · window 2" in page.text
-    assert HOSTILE[0] in page.text
