@@ -253,8 +253,7 @@ def typical_speed(rows: Nodes, step_s: float) -> float:
     is_pair = rows.is_observed[:, 1:] & rows.is_observed[:, :-1] & (duration > 0.25 * step_s)
     noise = rows.covariance_m2.diagonal(dim1=-2, dim2=-1).sum(-1)
     square = (torch.diff(rows.position_m, dim=1) ** 2).sum(-1) - noise[:, 1:] - noise[:, :-1]
-    mean_noise = float(noise[rows.is_observed].mean()) if rows.is_observed.any() else 0.0
-    floor_mps = max(0.05 * math.sqrt(mean_noise) / step_s, 1e-6)
+    floor_mps = max(0.05 * math.sqrt(_least_noise(noise, rows.is_observed)) / step_s, 1e-6)
     if not is_pair.any():
         return max(floor_mps, 1.0 / step_s)
     speed_square = (square / duration.clamp_min(1e-9) ** 2)[is_pair].clamp_min(0.0)
@@ -265,6 +264,15 @@ def typical_speed(rows: Nodes, step_s: float) -> float:
     cap = ordered[int(torch.searchsorted(share, torch.tensor(0.98, dtype=share.dtype)).clamp(max=len(ordered) - 1))]
     mean_square = float((weight * speed_square.clamp(max=cap)).sum() / weight.sum())
     return max(math.sqrt(mean_square), floor_mps)
+
+
+def _least_noise(noise_m2: Tensor, is_observed: Tensor) -> float:
+    """Mean noise [R, N] of the row that is known best: a row that says nothing must not decide for the others."""
+    has_any = is_observed.any(1)
+    if not has_any.any():
+        return 0.0
+    total = torch.where(is_observed, noise_m2, torch.zeros_like(noise_m2)).sum(1)
+    return float((total[has_any] / is_observed[has_any].sum(1)).min())
 
 
 def default_step(rows: Nodes) -> float:

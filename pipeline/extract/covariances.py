@@ -13,6 +13,8 @@ from pipeline.arrays import Bools, Float64s
 Covariance = tuple[float, float, float, float, float, float]
 
 NONE_COVARIANCE: Final[Covariance] = (math.nan,) * 6
+MAX_SIGMA_M: Final = 1e5
+"""A position that may be this far off says nothing about a mission; drivers write 1e308 and its like for "unknown"."""
 
 _MAX_SIGMAS: Final = 4.0
 _PLACES: Final = {  # xx, xy, yy and xz, yz, zz among as many numbers; without heights: only the first three
@@ -29,7 +31,7 @@ def isotropic(variance_m2: float) -> Covariance:
 
 
 def stated_covariance(matrix: Any) -> Covariance | None:
-    """The covariance that a message states; None where it says "unknown": another number of them, all zero, or negative.
+    """The covariance that a message states; None where it says "unknown": another number of them, all zero, negative, or huge.
 
     1 (a variance), 4, 9 or 36 numbers are rows of a matrix, 6 its upper triangle. `ValueError` where it is none.
     """
@@ -39,7 +41,7 @@ def stated_covariance(matrix: Any) -> Covariance | None:
     if places is None:
         return None
     xx, xy, yy, *rest = (float(matrix[place]) for place in places)
-    if xx == yy == 0 or xx < 0 or yy < 0:
+    if xx == yy == 0 or xx < 0 or yy < 0 or xx > MAX_SIGMA_M**2 or yy > MAX_SIGMA_M**2:
         return None
     if not (math.isfinite(xx) and math.isfinite(xy) and math.isfinite(yy) and xx * yy > xy * xy):
         raise ValueError("not positive definite")
@@ -66,7 +68,7 @@ def stated_covariances(matrices: Float64s) -> tuple[Float64s, Bools, Bools]:
     places = _PLACES[matrices.shape[1]]
     with np.errstate(all="ignore"):
         xx, xy, yy, *rest = (matrices[:, place] for place in places)
-        is_unknown = ((xx == 0) & (yy == 0)) | (xx < 0) | (yy < 0)
+        is_unknown = ((xx == 0) & (yy == 0)) | (xx < 0) | (yy < 0) | (xx > MAX_SIGMA_M**2) | (yy > MAX_SIGMA_M**2)
         is_definite = np.isfinite(xx) & np.isfinite(xy) & np.isfinite(yy) & (xx * yy > xy * xy)
         xz, yz, zz = rest or [np.zeros_like(xx)] * 3
         has_height = np.isfinite(xz) & np.isfinite(yz) & np.isfinite(zz) & (zz > 0)

@@ -254,6 +254,13 @@ def test_one_false_position_hardly_changes_the_typical_speed() -> None:
     assert typical_speed(track_rows(tracks), 1.0) == pytest.approx(5.0, rel=0.05)
 
 
+def test_a_row_that_says_nothing_does_not_decide_the_speed_of_others() -> None:
+    tracks = straight_tracks(5.0, 0.1)
+    covariance = tracks.covariance_m2.clone()
+    covariance[0] = 1e8 * EYE
+    assert typical_speed(track_rows(dataclasses.replace(tracks, covariance_m2=covariance)), 1.0) == pytest.approx(5.0, rel=0.05)
+
+
 def test_speed_is_never_zero() -> None:
     still = dataclasses.replace(straight_tracks(0.0, 0.0), covariance_m2=torch.zeros(30, 1, 20, 2, 2).double())
     assert typical_speed(track_rows(still), 1.0) > 0.0

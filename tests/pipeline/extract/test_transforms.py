@@ -134,6 +134,9 @@ def test_no_transforms() -> None:
         ([4.0, 1, 99, 1, 9, 0, 99, 0, 16], (4, 1, 9, 0, 0, 16)),  # heights that are no part of a covariance
         ([0.0] * 9, None),
         ([-1.0] + [0.0] * 8, None),
+        ([1e308, 0.0, 0.0, 1e308], None),  # what drivers write for "do not use"
+        ([4.0, 0.0, 0.0, float("inf")], None),
+        ([1e9, 0.0, 0.0, 1e9], (1e9, 0, 1e9, 0, 0, 1e9)),
         ([1.0, 2.0], None),
     ],
 )
@@ -141,7 +144,7 @@ def test_stated_covariances(matrix: object, expected: tuple[float, ...] | None) 
     assert stated_covariance(matrix) == expected
 
 
-@pytest.mark.parametrize("matrix", [[1.0, 5.0, 5.0, 1.0], [float("nan")] * 4, [float("inf"), 0, 0, 1]])
+@pytest.mark.parametrize("matrix", [[1.0, 5.0, 5.0, 1.0], [float("nan")] * 4, [4.0, 0.0, 0.0, 0.0]])
 def test_what_is_no_covariance(matrix: list[float]) -> None:
     with pytest.raises(ValueError, match="positive definite"):
         stated_covariance(matrix)
