@@ -142,9 +142,10 @@ def run(
       cadence run s3://fleet/2026-11 --out s3://fleet/tracks --engine ray
       cadence run flight.mcap --out results --set infer.num_hypotheses=50 --seed 7
     """
+    from pipeline.batch.config import RunConfig
+    from pipeline.batch.outcome import complaints, exit_code
     from pipeline.batch.run import run as run_all
     from pipeline.batch.run import selection_settings
-    from pipeline.batch.tasks import RunConfig, complaints, exit_code
 
     chosen = [*(settings or ()), *_COMBINED * combined, *_STRICT * strict, *selection_settings(start, end, topic or ())]
     resolved = stage_config(RunConfig, None, config, chosen, seed)
@@ -209,7 +210,7 @@ def infer(
     Example:
       cadence infer results/flight --set infer.num_hypotheses=50 --seed 7
     """
-    from pipeline.infer.stage import InferConfig
+    from pipeline.infer.config import InferConfig
     from pipeline.infer.stage import infer as stage
 
     _show(stage(mission, stage_config(InferConfig, "infer", config, settings or (), seed), Progress(quiet), force), as_json)
@@ -307,7 +308,7 @@ def train(
       cadence train --out runs/general --seed 1
       cadence train --out runs/ships --config ships.toml
     """
-    from pipeline.train.stage import TrainConfig
+    from pipeline.train.config import TrainConfig
     from pipeline.train.stage import train as stage
 
     _show(stage(out, stage_config(TrainConfig, "train", config, settings or (), seed), Progress(quiet), force), as_json)

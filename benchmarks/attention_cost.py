@@ -39,7 +39,7 @@ def main() -> None:
         for number in range(options.rounds + 1):
             for name, model in (("together", together), ("alone", alone)):
                 begun = time.process_time()
-                model.placed(windows.context).sample(windows.windows, NUM_HYPOTHESES)
+                model.sample(windows.windows, NUM_HYPOTHESES)
                 if number:  # the first round warms up
                     times[name].append(time.process_time() - begun)
         rows.append((agents, *(statistics.median(times[name]) for name in ("together", "alone"))))

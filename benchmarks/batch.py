@@ -17,11 +17,11 @@ from pathlib import Path
 import torch
 
 from cadence.constraints.obstacles import Obstacles
+from pipeline.batch.config import RunConfig
 from pipeline.batch.run import run
-from pipeline.batch.tasks import RunConfig
 from pipeline.checkpoints import checkpoint_hash, find_checkpoint
 from pipeline.config import stage_config
-from pipeline.estimators.scene import load_scene, scene_context, scene_grid
+from pipeline.estimators.scene import load_scene, scene_grid
 from pipeline.manifest import hash_file, write_atomic
 from pipeline.progress import Progress
 from pipeline.provenance import versions
@@ -87,11 +87,11 @@ def window_table(detections_path: Path, num_hypotheses: int = 30) -> list[str]:
     detections, _ = read_table(detections_path, "detections")
     model = load_scene(find_checkpoint("prison"))
     windows = build_windows(detections, plan_grid(detections, scene_grid(model.config, 1)), 0)
-    context = scene_context(windows, int(detections["time_ns"][0].as_py()))
+    batch = windows.located(int(detections["time_ns"][0].as_py()), Obstacles.none()).batch
     count = min(max(SIZES), windows.batch.num_windows)
 
     def draw(part: torch.Tensor) -> torch.Tensor:
-        return model.placed(context[part], Obstacles.none()).sample(windows.batch[part], num_hypotheses).position_m.nan_to_num()
+        return model.sample(batch[part], num_hypotheses).position_m.nan_to_num()
 
     together = draw(torch.arange(count))
     lines, alone_s = [], 0.0

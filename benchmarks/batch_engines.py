@@ -13,8 +13,9 @@ import tempfile
 import time
 from pathlib import Path
 
+from pipeline.batch.config import RunConfig
+from pipeline.batch.outcome import LogOutcome, exit_code
 from pipeline.batch.run import run
-from pipeline.batch.tasks import LogOutcome, RunConfig, exit_code
 from pipeline.config import stage_config
 from pipeline.manifest import hash_file, write_atomic
 from pipeline.progress import Progress

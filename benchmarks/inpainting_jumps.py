@@ -27,9 +27,10 @@ from cadence.worlds.patrol import PatrolConfig, simulate_patrol
 from pipeline.estimators.paper import load_absolute
 from pipeline.manifest import write_atomic
 from pipeline.progress import Progress
+from pipeline.train.config import AbsoluteTraining, TrainConfig
 from pipeline.train.missions import mission_of_episode
-from pipeline.train.paper import AbsoluteTraining, draw_windows
-from pipeline.train.stage import TrainConfig, train
+from pipeline.train.paper import draw_windows
+from pipeline.train.stage import train
 
 WORK = Path("out/benchmarks/inpainting_jumps")
 TEST_SEED = 900_001
@@ -93,7 +94,8 @@ def test_windows(model: AbsoluteModel, num_episodes: int) -> Test:
 def sampled(test: Test, sampling: AbsoluteSampling, num_hypotheses: int) -> Tensor:
     """Hypotheses [B, K, T, 2] of all test windows."""
     model = dataclasses.replace(test.model, sampling=sampling)
-    parts = [model.placed(Context(datum)).sample(batch, num_hypotheses).position_m[:, :, 0] for batch, datum in test.batches]
+    windows = (batch.with_context(Context(datum)) for batch, datum in test.batches)
+    parts = [model.sample(batch, num_hypotheses).position_m[:, :, 0] for batch in windows]
     return torch.cat(parts)
 
 

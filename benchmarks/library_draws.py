@@ -14,22 +14,20 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import torch
 
-from cadence.constraints.obstacles import Obstacles
 from cadence.diffusion.scene import SceneSampling
-from cadence.types import Context, HypothesisSet, WindowBatch
+from cadence.types import Detections, Estimator, HypothesisSet, WindowBatch
 from pipeline.checkpoints import checkpoint_hash, find_checkpoint
 from pipeline.episodes.recordings import RecordingsConfig, RecordingSet, load_recordings
 from pipeline.estimators.scene import load_scene
-from pipeline.forecast.forecasters import FORECAST_RIVALS
 from pipeline.forecast.leads import relative_lead
+from pipeline.forecast.rivals import FORECAST_RIVALS
 from pipeline.forecast.scores import HORIZONS, EpisodeScores
 from pipeline.forecast.stage import ForecastConfig, ForecastRun, forecast_windows
 from pipeline.forecast.tables import line, mean_interval, number, with_interval
-from pipeline.infer.placed_draws import Forecaster
 from pipeline.manifest import write_atomic
 from pipeline.progress import Progress
 
@@ -66,17 +64,16 @@ def all_cases(reference: Path | None) -> list[Case]:
 
 @dataclass(frozen=True, eq=False)
 class Together:
-    """A share of every window's hypotheses is drawn from the library, the others by the network; both are placed alike."""
+    """A share of every window's hypotheses is drawn from the library, the others by the network."""
 
     network: Any
     library: Any
     share: float
     name: str = "together"
 
-    def placed(self, context: Context, obstacles: Obstacles | None = None) -> "Together":
-        """Both in their place."""
-        here = {"network": self.network.placed(context, obstacles), "library": self.library.placed(context, obstacles)}
-        return dataclasses.replace(self, **here)
+    def fit(self, tracks: Detections) -> Self:
+        """Both as they are: neither adapts."""
+        return self
 
     def sample(self, windows: WindowBatch, num_hypotheses: int) -> HypothesisSet:
         """Hypotheses [B, K, A, T, 2], the network's first, all with the same weight."""
@@ -97,15 +94,15 @@ def score_case(case: Case, episodes: RecordingSet, options: argparse.Namespace, 
     trained = [checkpoint_hash(weights), sampling]
 
     @functools.cache
-    def network() -> Forecaster:
+    def network() -> Estimator:
         return load_scene(weights, sampling)
 
     @functools.cache
-    def library(count: int) -> Forecaster:
+    def library(count: int) -> Estimator:
         tracks = RecordingsConfig(world=case.world, set=case.set, first_index=FIRST_TRACK, num_episodes=count)  # type: ignore[arg-type]
         return FORECAST_RIVALS["library"](load_recordings(tracks, options.work / "episodes", progress).recordings)
 
-    def together(count: int, share: float) -> Forecaster:
+    def together(count: int, share: float) -> Estimator:
         return Together(network(), library(count), share)
 
     found = {"CADENCE": run.score(f"cadence-{case.name}", network, list(trained))}

@@ -9,7 +9,6 @@ are scored on windows like those of table I, beside the rivals and CADENCE. Scor
 """
 
 import argparse
-import dataclasses
 import functools
 import shlex
 import sys
@@ -27,15 +26,16 @@ from cadence.bank.rows import active_rows, scatter_hypotheses
 from cadence.diffusion.scene import SceneSampling
 from cadence.errors import CadenceError
 from cadence.recordings import Recordings
-from cadence.types import Context, Detections, HypothesisSet, WindowBatch
+from cadence.types import Detections, Estimator, HypothesisSet, WindowBatch
 from pipeline.checkpoints import checkpoint_hash, find_checkpoint
 from pipeline.episodes.recordings import RecordingsConfig, load_recordings
-from pipeline.forecast.forecasters import FORECAST_RIVALS, Samplings, Unguided, load_forecaster
+from pipeline.estimators.presets import load_forecaster
+from pipeline.estimators.samplings import Samplings
 from pipeline.forecast.leads import relative_lead
+from pipeline.forecast.rivals import FORECAST_RIVALS
 from pipeline.forecast.scores import HORIZONS, EpisodeScores
 from pipeline.forecast.stage import ForecastConfig, ForecastRun, forecast_windows
 from pipeline.forecast.tables import TITLES, line, with_interval
-from pipeline.infer.placed_draws import Forecaster
 from pipeline.manifest import write_atomic
 from pipeline.progress import Progress
 
@@ -55,21 +55,16 @@ class SameSoFar:
     """An estimator: the episodes that were where the target was seen, when it was seen, and are not over."""
 
     recordings: Recordings
-    context: Context | None = None
     name: str = "same so far"
 
     def fit(self, tracks: Detections) -> Self:
         """The recordings themselves: nothing is fitted."""
         return self
 
-    def placed(self, context: Context) -> Self:
-        """For windows with this context."""
-        return dataclasses.replace(self, context=context)
-
     def sample(self, windows: WindowBatch, num_hypotheses: int) -> HypothesisSet:
         """Continuations [B, K, 1, T, 2] of such episodes, drawn evenly in the order of where they are and go."""
-        context, recordings = self.context, self.recordings
-        assert context is not None and context.elapsed_s is not None
+        context, recordings = windows.required_context("SameSoFar"), self.recordings
+        assert context.elapsed_s is not None
         steps = np.rint(windows.time_s.double().numpy() / recordings.step_s).astype(np.int64)
         window = windows.is_active.nonzero(as_tuple=True)[0].numpy()
         nodes, seeds = active_rows(windows)
@@ -117,13 +112,13 @@ def rows_of(name: Literal["low", "high"], setup: Setup) -> tuple[dict[str, Episo
     episodes = load_recordings(of(seed=EVALUATION_SEED, num_episodes=setup.num_episodes), cache, setup.progress)
     windows = forecast_windows(episodes.recordings, setup.config)
     run = ForecastRun(episodes, windows, setup.config.num_hypotheses, setup.work / "scores", setup.progress)
-    samplings = Samplings(setup.config.paper, setup.config.scene)
+    samplings = Samplings(paper=setup.config.paper, scene=setup.config.scene)
 
     def training(num: int) -> Recordings:
         return load_recordings(of(seed=TRAINING_SEED, num_episodes=num), cache, setup.progress).recordings
 
-    def same_so_far() -> Forecaster:
-        return Unguided(SameSoFar(training(setup.num_training)))
+    def same_so_far() -> Estimator:
+        return SameSoFar(training(setup.num_training))
 
     found = {
         f"same so far, of {setup.num_training:,} episodes": run.score(

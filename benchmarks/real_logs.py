@@ -19,13 +19,15 @@ import numpy as np
 from cadence.errors import CadenceError
 from cadence.metrics import Interval, bootstrap_ratio
 from cadence.types import Estimator
-from pipeline.checkpoints import DEFAULT, find_checkpoint
-from pipeline.evaluate.rivals import RIVALS, FittingData
+from pipeline.checkpoints import DEFAULT
+from pipeline.estimators.fitting import FittingData
+from pipeline.estimators.presets import load_estimator
+from pipeline.estimators.samplings import GeneralSampling, Samplings
+from pipeline.evaluate.rivals import RIVALS
 from pipeline.evaluate.scores import METRICS, PARTS, Cells, compare, groups_of
 from pipeline.evaluate.stage import default_truth_gap_s
 from pipeline.extract.stage import ExtractConfig, extract
 from pipeline.extract.thinning import ThinningConfig
-from pipeline.infer.stage import InferConfig, fitted_model
 from pipeline.ingest.stage import IngestConfig, ingest
 from pipeline.manifest import write_atomic
 from pipeline.mapping.sources import SourceConfig
@@ -70,8 +72,8 @@ CASES = {
 
 
 def _model(data: FittingData, checkpoint: str, is_gated: bool) -> Estimator:
-    config = InferConfig(checkpoint=checkpoint, is_gated=is_gated)
-    return fitted_model(config, data.detections, data.grid, data.windows, find_checkpoint(checkpoint))
+    samplings = Samplings(general=GeneralSampling(is_gated=is_gated))
+    return load_estimator(checkpoint, samplings).fitted(data).estimator
 
 
 OWN = "cadence"

@@ -140,7 +140,7 @@ def drawn(row: Row, windows: ForecastWindows, episodes: JointRecordings, options
     if row.is_told_apart:
         found = told_apart(model, windows, episodes)
     else:
-        found = model.placed(windows.context).sample(windows.windows, NUM_HYPOTHESES)
+        found = model.sample(windows.windows, NUM_HYPOTHESES)
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_suffix(".part.npy")
     np.save(partial, found.position_m.float().numpy())
@@ -168,7 +168,7 @@ def told_apart(model: SceneModel, windows: ForecastWindows, episodes: JointRecor
         w = windows.windows
         seeds = w.seeds[pick] + torch.arange(slots).repeat(len(chunk))
         batch = WindowBatch(w.time_s, joined(chunk), seeds, 0)
-        drawn = model.placed(windows.context[pick]).sample(batch, per_way).position_m
+        drawn = model.sample(batch.with_context(windows.context[pick]), per_way).position_m
         parts.append(drawn.reshape(len(chunk), NUM_HYPOTHESES, *drawn.shape[2:]))
     position = torch.cat(parts)
     last = torch.stack([_latest(windows.windows.detections[slice(b, b + 1)]) for b in range(len(windows))])

@@ -38,7 +38,10 @@ from cadence.types import HypothesisSet
 from cadence.worlds.episode import Episode
 from cadence.worlds.patrol import PatrolConfig, simulate_patrol
 from pipeline.checkpoints import checkpoint_hash, find_checkpoint
-from pipeline.infer.stage import InferConfig, draw_hypotheses, fitted_model
+from pipeline.estimators.fitting import FittingData
+from pipeline.estimators.presets import load_estimator
+from pipeline.estimators.samplings import GeneralSampling, Samplings
+from pipeline.infer.draws import draw_windows
 from pipeline.manifest import write_atomic
 from pipeline.provenance import versions
 from pipeline.train.missions import mission_of_episode
@@ -89,8 +92,9 @@ def build_case(seed: int, index: int, num_windows: int, num_hypotheses: int, wei
     usable = torch.nonzero((is_known[..., grid.origin_index + 1 :].all(-1) & windows.batch.is_active).all(1))[:, 0]
     if len(usable) < num_windows:
         return None
-    config = InferConfig(checkpoint=str(weights), is_gated=False, seed=seed)
-    model = fitted_model(config, mission.detections, grid, windows, weights)
+    loaded = load_estimator(str(weights), Samplings(general=GeneralSampling(is_gated=False)))
+    model = loaded.fitted(FittingData.of(mission.detections, grid, windows)).estimator
+    assert isinstance(model, GeneralModel)
     pick = usable[torch.linspace(0, len(usable) - 1, num_windows).round().long()]
     chosen = dataclasses.replace(
         windows, batch=windows.batch[pick], origins_ns=windows.origins_ns[pick.numpy()], datum_m=windows.datum_m[pick.numpy()]
@@ -102,8 +106,8 @@ def build_case(seed: int, index: int, num_windows: int, num_hypotheses: int, wei
 def default_path(case: Case, sampler: str = "rotation", num_steps: int = 6) -> HypothesisSet:
     """What `infer` does with these windows once its model is fitted: bank, sampler with guidance, repair and weights."""
     model = dataclasses.replace(case.model, sampler=sampler, num_steps=num_steps)
-    config = InferConfig(num_hypotheses=case.num_hypotheses)
-    parts = list(draw_hypotheses(model, case.windows, config, case.obstacles))
+    windows = case.windows.located(int(case.windows.origins_ns[0]), case.obstacles)
+    parts = list(draw_windows(model, windows, case.num_hypotheses, is_apart=True))
     position, weight = torch.cat([part[1] for part in parts]), torch.cat([part[2] for part in parts])
     return HypothesisSet(position, weight, tuple(tuple(row) for part in parts for row in part[3]))
 
@@ -256,9 +260,9 @@ def network_seconds(case: Case, sampler: str, num_steps: int) -> float:
     """Processor seconds of the default's sampling alone: no bank, no repair; guided as in `infer`."""
     posterior, context = bank_context(case)
     limits = Feasibility(case.obstacles, 0.0, None, case.windows.batch.step_s, case.datum_m)
-    model = dataclasses.replace(case.model, sampler=sampler, num_steps=num_steps, guide=limits.guide)
+    model = dataclasses.replace(case.model, sampler=sampler, num_steps=num_steps)
     begin = time.process_time()
-    model._denoise(posterior, context)
+    model._denoise(posterior, context, limits.guide)
     return time.process_time() - begin
 
 

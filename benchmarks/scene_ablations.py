@@ -39,8 +39,8 @@ from pipeline.forecast.stage import ForecastConfig, ForecastRun, forecast_window
 from pipeline.forecast.tables import comparison, line, mean_interval, number, with_interval
 from pipeline.manifest import write_atomic
 from pipeline.progress import Progress
-from pipeline.train.scene import SceneTraining, train_scene_network, untrained_network
-from pipeline.train.stage import TrainConfig
+from pipeline.train.config import SceneTraining, TrainConfig
+from pipeline.train.scene import train_scene_network, untrained_network
 
 SETS = ("low", "med", "high")
 KINDS = ("simulated", "original")

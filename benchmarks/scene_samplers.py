@@ -132,7 +132,8 @@ def block_of(
 def sampled(model: SceneModel, block: ForecastWindows, task: Task) -> tuple[HypothesisSet, float]:
     """Hypotheses of a block and the processor time they took."""
     begin = time.process_time()
-    drawn = model.placed(block.context, task.obstacles).sample(block.windows, task.num_hypotheses)
+    context = dataclasses.replace(block.context, obstacles=task.obstacles)
+    drawn = model.sample(block.windows.with_context(context), task.num_hypotheses)
     return drawn, time.process_time() - begin
 
 

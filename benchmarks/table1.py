@@ -34,13 +34,15 @@ from cadence.diffusion.absolute import AbsoluteSampling
 from cadence.diffusion.scene import SceneSampling
 from cadence.errors import CadenceError, InputError
 from cadence.recordings import Recordings
+from cadence.types import Estimator
 from pipeline.checkpoints import checkpoint_hash, find_checkpoint, read_info, windows_seen
 from pipeline.config import config_as_dict
 from pipeline.episodes.recordings import RecordingsConfig, load_recordings
-from pipeline.forecast.forecasters import FORECAST_RIVALS, Samplings, load_forecaster
+from pipeline.estimators.presets import load_forecaster
+from pipeline.estimators.samplings import Samplings
 from pipeline.forecast.leads import averaged
+from pipeline.forecast.rivals import FORECAST_RIVALS
 from pipeline.forecast.stage import ForecastConfig, ForecastRun, forecast_windows, truth_scores
-from pipeline.infer.placed_draws import Forecaster
 from pipeline.manifest import write_atomic
 from pipeline.progress import Progress
 
@@ -139,14 +141,14 @@ def _joined(sources: Sequence[RecordingsConfig], cache: Path, progress: Progress
     return Recordings.concatenate([load_recordings(source, cache, progress).recordings for source in sources])
 
 
-def _rival(name: str, sources: Sequence[RecordingsConfig], training: Callable[..., Recordings]) -> Forecaster:
+def _rival(name: str, sources: Sequence[RecordingsConfig], training: Callable[..., Recordings]) -> Estimator:
     return FORECAST_RIVALS[name](training(tuple(sources)))
 
 
 def _learned(name: str, case: Case, paths: Sequence[Path], run: ForecastRun, setup: Setup, goal: bool) -> Found | None:
     """Scores of all trainings of a method; None without any, or where it is not for windows with or without a known goal."""
     parts, budgets = [], []
-    samplings = Samplings(setup.config.paper, setup.config.scene)
+    samplings = Samplings(paper=setup.config.paper, scene=setup.config.scene)
     for path in paths:
         info = read_info(path)
         is_reader = reads_goal(info.network)

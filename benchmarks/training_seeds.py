@@ -30,16 +30,17 @@ from pipeline.checkpoints import checkpoint_hash, read_info, windows_seen
 from pipeline.config import stage_config
 from pipeline.episodes.pool import EpisodePool, EpisodeSource
 from pipeline.episodes.recordings import RecordingsConfig, load_recordings
-from pipeline.forecast.forecasters import Samplings, load_forecaster
+from pipeline.estimators.presets import load_forecaster
+from pipeline.estimators.samplings import Samplings
 from pipeline.forecast.leads import averaged, count, relative_lead, verdicts
 from pipeline.forecast.scores import HORIZONS, EpisodeScores
 from pipeline.forecast.stage import ForecastConfig, ForecastRun, forecast_windows
 from pipeline.forecast.tables import TITLES, line, number, with_interval
 from pipeline.manifest import write_atomic
 from pipeline.progress import Progress
+from pipeline.train.config import TrainConfig
 from pipeline.train.rivals import train_rival
 from pipeline.train.scene import train_scene_network, untrained_network
-from pipeline.train.stage import TrainConfig
 
 World = Literal["prison", "narco"]
 WORLDS: tuple[World, ...] = ("prison", "narco")
@@ -143,7 +144,7 @@ def evaluation_run(world: World, setup: Setup) -> ForecastRun:
 def scores_of(world: World, run: ForecastRun, setup: Setup) -> Scores:
     """Of every training that is done."""
     found: Scores = {}
-    samplings = Samplings(setup.config.paper, setup.config.scene)
+    samplings = Samplings(paper=setup.config.paper, scene=setup.config.scene)
     for method in METHODS:
         for seed in setup.seeds:
             path = setup.training(method, world, seed) / "checkpoint.safetensors"

@@ -125,14 +125,12 @@ class ForecastWindows:
     """B windows of A agents: what is known, and what came.
 
     windows  their grid is now and the steps after it; the datum is the last detection of the first agent that has one, or the
-             map's origin without any
-    context  all that `Context` has; the trackers are those of the first agent's track
+             map's origin without any. The context has all but obstacles; the trackers are those of the first agent's track
     truth_m  [B, A, T, 2] relative to the datum, float64
     episode, step  [B] int64 where they were cut
     """
 
     windows: WindowBatch
-    context: Context
     truth_m: Tensor
     episode: Tensor
     step: Tensor
@@ -140,9 +138,18 @@ class ForecastWindows:
     def __len__(self) -> int:
         return len(self.episode)
 
+    @property
+    def context(self) -> Context:
+        """What is known beside the detections."""
+        return self.windows.required_context("ForecastWindows")
+
+    def with_context(self, context: Context) -> "ForecastWindows":
+        """The same windows, of which something else is known."""
+        return dataclasses.replace(self, windows=self.windows.with_context(context))
+
     def __getitem__(self, pick: slice | Tensor) -> "ForecastWindows":
         """A selection of windows."""
-        return ForecastWindows(self.windows[pick], self.context[pick], self.truth_m[pick], self.episode[pick], self.step[pick])
+        return ForecastWindows(self.windows[pick], self.truth_m[pick], self.episode[pick], self.step[pick])
 
     def apart(self) -> "ForecastWindows":
         """Every agent of every window as a window of its own [B * A], the agents of a window in a row."""
@@ -153,8 +160,8 @@ class ForecastWindows:
         columns = (value.flatten(0, 1)[:, None] for value in (d.time_s, d.position_m, d.covariance_m2, d.is_observed))
         seeds = rows.windows.seeds * size + torch.arange(size).repeat(len(self))
         context = dataclasses.replace(rows.context, known_goal_m=None if goal is None else goal.flatten(0, 1)[:, None])
-        alone = WindowBatch(self.windows.time_s, Detections(*columns), seeds, self.windows.origin_index)
-        return dataclasses.replace(rows, windows=alone, context=context, truth_m=self.truth_m.flatten(0, 1)[:, None])
+        alone = WindowBatch(self.windows.time_s, Detections(*columns), seeds, self.windows.origin_index, context)
+        return dataclasses.replace(rows, windows=alone, truth_m=self.truth_m.flatten(0, 1)[:, None])
 
 
 def choose_windows(
@@ -223,13 +230,12 @@ def cut_windows(
     later = np.minimum(now[:, None] + np.arange(NUM_STEPS), end[:, None] - 1)
     context = Context(
         torch.from_numpy(datum),
-        torch.from_numpy(step * recordings.step_s),
-        torch.from_numpy(by_window(recordings.known_goal_m[track])).double(),
-        torch.from_numpy(_trackers(recordings, begin[::agents], now[::agents], num_tracker_steps)),
+        elapsed_s=torch.from_numpy(step * recordings.step_s),
+        known_goal_m=torch.from_numpy(by_window(recordings.known_goal_m[track])).double(),
+        tracker_m=torch.from_numpy(_trackers(recordings, begin[::agents], now[::agents], num_tracker_steps)),
     )
     return ForecastWindows(
-        WindowBatch(time_s, detections, torch.from_numpy((seed * 1_000_003 + episode) * 10_007 + step), 0),
-        context,
+        WindowBatch(time_s, detections, torch.from_numpy((seed * 1_000_003 + episode) * 10_007 + step), 0, context),
         torch.from_numpy(by_window(place[later]) - datum[:, None, None]),
         torch.from_numpy(np.asarray(episode, dtype=np.int64)),
         torch.from_numpy(np.asarray(step, dtype=np.int64)),

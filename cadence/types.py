@@ -4,11 +4,13 @@ Letters of every shape: B window, K hypothesis, A agent, T time step, D space (2
 relative to the window origin, positions float metres relative to the window datum (float64 in, see `pipeline.windows`).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Protocol, Self
 
 import torch
 from torch import Tensor
+
+from cadence.constraints.obstacles import Obstacles
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,6 +51,42 @@ class Detections:
 
 
 @dataclass(frozen=True, eq=False)
+class Context:
+    """What is known of B windows beside the detections: where they are, and what estimators may read or must obey there.
+
+    datum_m       [B, 2] float64: what window positions are relative to, in the mission frame
+    elapsed_s     [B] seconds from the beginning of the mission to the window origin
+    known_goal_m  [B, A, 2] a goal that the searching side knows of, in the mission frame; NaN: none known
+    tracker_m     [B, H, M, 2] positions of M moving trackers at the last H steps up to the origin, oldest first, in the
+                  mission frame; NaN: absent
+    obstacles     of the place, in the mission frame, the same for all windows; hypotheses keep out of them
+    """
+
+    datum_m: Tensor
+    elapsed_s: Tensor | None = None
+    known_goal_m: Tensor | None = None
+    tracker_m: Tensor | None = None
+    obstacles: Obstacles = field(default_factory=Obstacles.none)
+
+    def __post_init__(self) -> None:
+        b = len(self.datum_m)
+        if self.datum_m.shape != (b, 2):
+            raise ValueError(f"Context.datum_m has shape {tuple(self.datum_m.shape)}, expected [B, 2]")
+        for name, ndim in (("elapsed_s", 1), ("known_goal_m", 3), ("tracker_m", 4)):
+            value = getattr(self, name)
+            if value is not None and (value.ndim != ndim or len(value) != b):
+                raise ValueError(f"Context.{name} has shape {tuple(value.shape)}, expected {ndim} axes, {b} windows first")
+
+    def __getitem__(self, windows: slice | Tensor) -> "Context":
+        """The same for a selection of windows."""
+        given = {name: value[windows] for name, value in vars(self).items() if isinstance(value, Tensor)}
+        return Context(obstacles=self.obstacles, **given)
+
+    def __len__(self) -> int:
+        return len(self.datum_m)
+
+
+@dataclass(frozen=True, eq=False)
 class WindowBatch:
     """Windows that share one time grid.
 
@@ -56,16 +94,20 @@ class WindowBatch:
     detections see `Detections`; all lie at or before the origin (the future is what is asked for)
     seeds      [B] int64, one per window: a hypothesis depends on its window's seed, never on its neighbours in the batch
     origin_index  number of steps before the origin
+    context    what is known beside the detections; None where nothing is, not even where the windows lie
     """
 
     time_s: Tensor
     detections: Detections
     seeds: Tensor
     origin_index: int
+    context: Context | None = None
 
     def __post_init__(self) -> None:
         if self.time_s.ndim != 1 or not 0 <= self.origin_index < len(self.time_s):
             raise ValueError(f"WindowBatch: origin_index {self.origin_index} outside a grid of {tuple(self.time_s.shape)}")
+        if self.context is not None and len(self.context) != self.num_windows:
+            raise ValueError(f"WindowBatch: a context of {len(self.context)} windows for {self.num_windows}")
         if self.seeds.shape != self.detections.time_s.shape[:1]:
             raise ValueError(f"WindowBatch: {tuple(self.seeds.shape)} seeds for {self.num_windows} windows")
 
@@ -96,38 +138,18 @@ class WindowBatch:
 
     def __getitem__(self, windows: slice | Tensor) -> "WindowBatch":
         """The same grid for a selection of windows."""
-        return WindowBatch(self.time_s, self.detections[windows], self.seeds[windows], self.origin_index)
+        context = None if self.context is None else self.context[windows]
+        return WindowBatch(self.time_s, self.detections[windows], self.seeds[windows], self.origin_index, context)
 
+    def required_context(self, reader: str) -> Context:
+        """The context, for a reader that cannot do without; ValueError names it where there is none."""
+        if self.context is None:
+            raise ValueError(f"{reader}: the windows do not say where they are; give their batch a context")
+        return self.context
 
-@dataclass(frozen=True, eq=False)
-class Context:
-    """What is known of B windows beside the detections; estimators that learned a place need it.
-
-    datum_m       [B, 2] float64: what window positions are relative to, in the mission frame
-    elapsed_s     [B] seconds from the beginning of the mission to the window origin
-    known_goal_m  [B, A, 2] a goal that the searching side knows of, in the mission frame; NaN: none known
-    tracker_m     [B, H, M, 2] positions of M moving trackers at the last H steps up to the origin, oldest first, in the
-                  mission frame; NaN: absent
-    """
-
-    datum_m: Tensor
-    elapsed_s: Tensor | None = None
-    known_goal_m: Tensor | None = None
-    tracker_m: Tensor | None = None
-
-    def __post_init__(self) -> None:
-        b = len(self.datum_m)
-        if self.datum_m.shape != (b, 2):
-            raise ValueError(f"Context.datum_m has shape {tuple(self.datum_m.shape)}, expected [B, 2]")
-        for name, ndim in (("elapsed_s", 1), ("known_goal_m", 3), ("tracker_m", 4)):
-            value = getattr(self, name)
-            if value is not None and (value.ndim != ndim or len(value) != b):
-                raise ValueError(f"Context.{name} has shape {tuple(value.shape)}, expected {ndim} axes, {b} windows first")
-
-    def __getitem__(self, windows: slice | Tensor) -> "Context":
-        """The same for a selection of windows."""
-        given = {name: value[windows] for name, value in vars(self).items() if value is not None}
-        return Context(**given)
+    def with_context(self, context: Context | None) -> "WindowBatch":
+        """The same windows, of which something else is known."""
+        return replace(self, context=context)
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,7 +176,11 @@ class HypothesisSet:
 
 
 class Estimator(Protocol):
-    """What the diffusion model and every rival implement: the same call, joint samples out."""
+    """What the diffusion model and every rival implement: the same call, joint samples out.
+
+    All that is known of a window is in the window: its detections, and its context. An estimator reads of the context what it
+    can; obstacles it either obeys or knows nothing of.
+    """
 
     @property
     def name(self) -> str:

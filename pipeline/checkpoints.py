@@ -19,6 +19,9 @@ from pipeline.config import config_as_dict, read_config
 from pipeline.manifest import hash_file, write_atomic
 
 FORMAT = 1
+WEIGHTS_NAME = "checkpoint.safetensors"
+"""What a training calls its weights, in a folder of its own."""
+
 DEFAULT = "general"
 """Name of the shipped checkpoint that is used unless another is asked for."""
 
@@ -76,6 +79,15 @@ def read_info(path: Path) -> CheckpointInfo:
     if not isinstance(content, Mapping) or content.get("format") != FORMAT:
         raise ConfigError(f"{beside}: not a checkpoint of format {FORMAT}; train again or take one that fits this version")
     return read_config(CheckpointInfo, content, str(beside))
+
+
+def expect_preset(path: Path, *presets: str) -> CheckpointInfo:
+    """What stands beside the weights at `path`; `ConfigError` where they are of another preset."""
+    info = read_info(path)
+    if info.preset not in presets:
+        wanted = " or ".join(map(repr, presets))
+        raise ConfigError(f"{path}: a checkpoint of the preset {info.preset!r}, expected one of the preset {wanted}")
+    return info
 
 
 @functools.lru_cache(maxsize=2)  # a worker runs many logs with the same weights; networks get copies

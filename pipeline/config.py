@@ -125,6 +125,21 @@ def read_config(cls: type[T], tables: Mapping[str, Any], where: str = "config") 
         raise ConfigError(f"{where}: {error}") from error
 
 
+def changed_settings(config: object) -> list[str]:
+    """Names `a.b` of the settings that differ from those of the configuration's class with nothing configured."""
+    return _changed(config_as_dict(config), config_as_dict(type(config)()))
+
+
+def _changed(config: Mapping[str, Any], default: Mapping[str, Any]) -> list[str]:
+    found = []
+    for name, value in config.items():
+        if isinstance(value, Mapping) and isinstance(default.get(name), Mapping):
+            found += [f"{name}.{inner}" for inner in _changed(value, default[name])]
+        elif value != default.get(name):
+            found.append(name)
+    return found
+
+
 def config_as_dict(config: object) -> dict[str, Any]:
     """The resolved configuration as plain JSON-able values, for manifests."""
     return typing.cast(dict[str, Any], _plain(dataclasses.asdict(config)))  # type: ignore[call-overload]

@@ -15,6 +15,9 @@ from pipeline.logs.parts import METADATA_NAME, group_parts, mission_name, named_
 from pipeline.stores.objects import StoredObject, find_objects, read_bytes
 from pipeline.stores.urls import is_url, shown, url_name
 
+CATALOGUE_NAME: Final = "catalogue.json"
+"""What ingest leaves in a mission directory (`pipeline.catalogue`): by it one is known."""
+
 _OWN_ENDINGS: Final = (".cadence.mcap", ".combined.mcap")
 
 
@@ -63,7 +66,7 @@ def mission_directories(logs: Sequence[Path], out: Path) -> dict[Path, Path]:
 
 def is_mission_directory(path: Path) -> bool:
     """Whether a log was ingested into `path`, as opposed to a folder of mission directories."""
-    return (path / "catalogue.json").is_file()
+    return (path / CATALOGUE_NAME).is_file()
 
 
 def _paths(text: str) -> Iterator[Path]:
@@ -170,7 +173,7 @@ def _directories(groups: Sequence[tuple[str, ...]], out: str) -> list[str]:
 def _ingested_log(directory: Path) -> Path | None:
     """The log whose results a mission directory holds; None where it holds none, or the log was fetched for it."""
     try:
-        path = Path(json.loads((directory / "catalogue.json").read_text(encoding="utf-8"))["path"])
+        path = Path(json.loads((directory / CATALOGUE_NAME).read_text(encoding="utf-8"))["path"])
     except (OSError, ValueError, KeyError, TypeError):
         return None
     return path if path.is_absolute() else None

@@ -7,7 +7,7 @@ float64 mission coordinates end here.
 import itertools
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pyarrow as pa
@@ -15,13 +15,14 @@ import pyarrow.compute as pc
 import torch
 from torch import Tensor
 
+from cadence.constraints.obstacles import Obstacles
 from cadence.errors import ConfigError, InputError
-from cadence.types import Detections, WindowBatch
+from cadence.types import Context, Detections, WindowBatch
 from pipeline.arrays import Bools, Float64s, Int64s
 
 UNKNOWN_AGENT = "unknown"
 """Name of the one agent that detections of unknown origin are taken to belong to where they are not told apart
-(`pipeline.infer.ways` does that)."""
+(`pipeline.associations` does that)."""
 
 _NICE = np.array([1.0, 1.2, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0])
 _STEPS_PER_GAP = 16.0
@@ -98,6 +99,15 @@ class MissionWindows:
     step_ns: int
     agent_ids: tuple[str, ...]
     datum_m: Float64s
+
+    def located(self, start_ns: int, obstacles: Obstacles) -> "MissionWindows":
+        """The same windows with all that is known beside the detections of a mission that began at `start_ns`.
+
+        Neither goals nor trackers are: logs do not say what they are.
+        """
+        elapsed_s = torch.from_numpy((self.origins_ns - start_ns).astype(np.float64) * 1e-9).clamp_min(0.0)
+        context = Context(torch.from_numpy(self.datum_m), elapsed_s, obstacles=obstacles)
+        return replace(self, batch=self.batch.with_context(context))
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,6 +1,7 @@
 """The plan of the house, held by its source code: who may import whom, and what must not be written at all."""
 
 import ast
+import graphlib
 from pathlib import Path
 
 import pytest
@@ -17,6 +18,22 @@ MAY_IMPORT = {
 }
 # cli knows the exceptions and nothing else of the estimators.
 CLI_MAY_IMPORT_FROM_CADENCE = {"cadence.errors"}
+# Inside a layer, from the ground up: what stands on a floor may import what stands below it, and nothing beside it.
+FLOORS = {
+    "pipeline": (
+        {"arrays", "config", "locks", "progress", "provenance", "plain_rows", "obstacle_file"},
+        {"manifest", "tables"},
+        {"frames", "stores", "logs", "mapping"},
+        {"missions", "checkpoints", "windows", "results"},
+        {"catalogue", "associations"},
+        {"estimators"},
+        {"ingest", "extract", "infer", "export", "report", "simulate"},  # no stage imports another
+        {"episodes"},
+        {"forecast", "train"},
+        {"evaluate"},
+        {"batch", "inspect"},
+    ),
+}
 FORBIDDEN_MODULES = {"pickle", "cPickle", "dill", "joblib", "cloudpickle", "marshal", "shelve"}
 # What would make `cadence` depend on the world outside its arguments.
 NOT_IN_CADENCE = {
@@ -67,6 +84,54 @@ def imported_modules(tree: ast.Module) -> set[str]:
     return found
 
 
+def source_modules() -> dict[str, Path]:
+    """Every module of the layers by its dotted name."""
+    found = {".".join(path.relative_to(ROOT).with_suffix("").parts): path for path in SOURCES}
+    return {name.removesuffix(".__init__"): path for name, path in found.items()}
+
+
+def imports_within(modules: dict[str, ast.Module]) -> dict[str, set[str]]:
+    """Which of the modules each of them imports, those behind TYPE_CHECKING counted."""
+    arrows: dict[str, set[str]] = {}
+    for name, tree in modules.items():
+        found = set()
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Import):
+                found |= {alias.name for alias in node.names}
+            elif isinstance(node, ast.ImportFrom) and node.module:
+                inner = {f"{node.module}.{alias.name}" for alias in node.names}
+                found |= {item if item in modules else node.module for item in inner}
+        arrows[name] = {item for item in found if item in modules and item != name}
+    return arrows
+
+
+def room_of(module: str) -> str:
+    """The package of a module inside its layer, or the module itself where it stands in none."""
+    return module.split(".")[1] if "." in module else module
+
+
+def upward_imports(arrows: dict[str, set[str]], layer: str) -> list[str]:
+    """Imports between rooms of a layer that do not point downwards."""
+    height = {room: number for number, floor in enumerate(FLOORS[layer]) for room in floor}
+    wrong = []
+    for module, imported in sorted(arrows.items()):
+        for other in sorted(imported):
+            rooms = room_of(module), room_of(other)
+            inside = module.startswith(f"{layer}.") and other.startswith(f"{layer}.") and rooms[0] != rooms[1]
+            if inside and height[rooms[0]] <= height[rooms[1]]:
+                wrong.append(f"{module} imports {other}")
+    return wrong
+
+
+def circle_of(arrows: dict[str, set[str]]) -> list[str]:
+    """A circle of imports, or nothing."""
+    try:
+        tuple(graphlib.TopologicalSorter(arrows).static_order())
+    except graphlib.CycleError as error:
+        return list(error.args[1])
+    return []
+
+
 def every_source(test):
     return pytest.mark.parametrize("path", SOURCES, ids=name_of)(test)
 
@@ -84,6 +149,36 @@ def test_imports_point_downwards(path):
     assert not tops & (FORBIDDEN_MODULES | GPL_PACKAGES)
     if layer == "cadence":
         assert not tops & NOT_IN_CADENCE, "cadence is pure: no files, no clock, no formats"
+
+
+@pytest.fixture(scope="module")
+def arrows() -> dict[str, set[str]]:
+    return imports_within({name: tree_of(path) for name, path in source_modules().items()})
+
+
+@pytest.mark.parametrize("layer", FLOORS)
+def test_packages_stand_on_floors_and_import_downwards(arrows, layer):
+    rooms = {room_of(module) for module in arrows if module.startswith(f"{layer}.")}
+    assert rooms == set().union(*FLOORS[layer]), "a room without a floor, or a floor without its room"
+    assert not upward_imports(arrows, layer)
+
+
+def test_no_module_imports_itself_in_a_circle(arrows):
+    assert not circle_of(arrows)
+
+
+def test_planted_offences_against_the_order_are_caught():
+    planted = {
+        "pipeline.infer.stage": "from pipeline.extract import thinning\nimport pipeline.windows",
+        "pipeline.extract.thinning": "",
+        "pipeline.windows": "if TYPE_CHECKING:\n    from pipeline.infer.stage import infer",
+    }
+    arrows = imports_within({name: ast.parse(text) for name, text in planted.items()})
+    assert upward_imports(arrows, "pipeline") == [
+        "pipeline.infer.stage imports pipeline.extract.thinning",
+        "pipeline.windows imports pipeline.infer.stage",
+    ]
+    assert set(circle_of(arrows)) == {"pipeline.infer.stage", "pipeline.windows"}
 
 
 @every_source

@@ -37,6 +37,17 @@ def scatter_hypotheses(sample_m: Tensor, windows: WindowBatch) -> HypothesisSet:
     return HypothesisSet(position.transpose(1, 2), torch.full((b, k), 1.0 / k, dtype=sample_m.dtype), status)
 
 
+def with_status(drawn: HypothesisSet, windows: WindowBatch, is_diverged: Tensor, is_infeasible: Tensor) -> HypothesisSet:
+    """The same hypotheses; active agents, rows [R], are "guidance_diverged" or "infeasible" where that is said of them."""
+    status = [list(words) for words in drawn.status]
+    for row, (window, agent) in enumerate(windows.is_active.nonzero().tolist()):
+        if bool(is_diverged[row]):
+            status[window][agent] = "guidance_diverged"
+        elif bool(is_infeasible[row]):
+            status[window][agent] = "infeasible"
+    return HypothesisSet(drawn.position_m, drawn.weight, tuple(map(tuple, status)))
+
+
 def track_rows(tracks: Detections) -> Nodes:
     """Stretches of detections [B, 1, N] as rows [R, N] (stretches without any left out)."""
     seeds = torch.zeros(len(tracks.time_s), dtype=torch.int64)

@@ -188,7 +188,7 @@ class _Query:
 
 @dataclass(frozen=True, eq=False)
 class TrajectoryLibrary:
-    """The library as an `Estimator`; it needs to know where the windows lie (`placed`).
+    """The library as an `Estimator`; it needs to know where the windows lie.
 
     Windows of any grid with the recordings' step are taken. Hypotheses have equal weights.
     """
@@ -196,7 +196,6 @@ class TrajectoryLibrary:
     recordings: Recordings
     states: _States
     config: LibraryConfig
-    context: Context | None = None
     name: str = "library"
 
     @staticmethod
@@ -213,24 +212,20 @@ class TrajectoryLibrary:
         """The library itself: it knows its recordings and adapts to nothing."""
         return self
 
-    def placed(self, context: Context) -> Self:
-        """The library for windows with this context."""
-        return dataclasses.replace(self, context=context)
-
     def sample(self, windows: WindowBatch, num_hypotheses: int) -> HypothesisSet:
         """Continuations of recorded episodes [B, K, A, T, 2]; deterministic in the windows' seeds, agent by agent."""
-        if self.context is None or len(self.context.datum_m) != windows.num_windows:
-            raise ValueError("TrajectoryLibrary: the windows have no place in the mission frame; use placed()")
+        context = windows.required_context("TrajectoryLibrary")
         steps = np.rint(windows.time_s.double().numpy() / self.recordings.step_s).astype(np.int64)
         window, agent = (index.numpy() for index in windows.is_active.nonzero(as_tuple=True))
         nodes, seeds = active_rows(windows)
         sample_m = np.empty((len(window), num_hypotheses, len(steps), 2))
         for row in range(len(window)):
             count = int(nodes.is_observed[row].sum())
-            datum_m = self.context.datum_m[window[row]].double().numpy()
+            datum_m = context.datum_m[window[row]].double().numpy()
             query = self._query(
                 np.rint(-nodes.time_s[row, :count].numpy()[::-1] / self.recordings.step_s).astype(np.int64),
                 nodes.position_m[row, :count].numpy()[::-1] + datum_m,
+                context,
                 int(window[row]),
                 int(agent[row]),
             )
@@ -239,10 +234,9 @@ class TrajectoryLibrary:
             sample_m[row] = self._continued(query, state[drawn], steps) - datum_m
         return scatter_hypotheses(torch.from_numpy(sample_m), windows)
 
-    def _query(self, age: Int64s, position_m: Float64s, window: int, agent: int) -> _Query:
+    def _query(self, age: Int64s, position_m: Float64s, context: Context, window: int, agent: int) -> _Query:
         """What is compared of the detections [N], newest first, and of the context."""
-        context, lag = self.context, age - age[0]
-        assert context is not None
+        lag = age - age[0]
         chosen = spaced_lags(lag, self.config.num_detections, self.config.lag_growth)
         elapsed = None if context.elapsed_s is None else float(context.elapsed_s[window]) / self.recordings.step_s
         goal_m = np.full(2, np.nan)

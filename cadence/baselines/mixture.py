@@ -236,8 +236,9 @@ class MixtureNetwork(Protocol):
         ...
 
 
-def mixture_inputs(windows: WindowBatch, context: Context, frame: MixtureFrame, history: HistoryConfig) -> MixtureInputs:
+def mixture_inputs(windows: WindowBatch, frame: MixtureFrame, history: HistoryConfig) -> MixtureInputs:
     """Inputs of windows with one agent; `ConfigError` where the context lacks one."""
+    context = windows.required_context("mixture_inputs")
     if context.elapsed_s is None and history.elapsed:
         raise ConfigError("this checkpoint wants the time since the mission's start, and none is given")
     detections = windows.detections
@@ -292,7 +293,7 @@ def encode_sequences(encoder: DetectionEncoder, rows: Tensor, is_observed: Tenso
 class MixtureModel:
     """A trained mixture network as an `Estimator`, for windows of one agent whose first step is now.
 
-    `placed` gives it the windows' context: datum, elapsed time, trackers, known goal. Windows without any detection are NaN.
+    It reads of the windows' context: datum, elapsed time, trackers, known goal. Windows without any detection are NaN.
 
     uses_goal      a known goal is read where the network and the context have one
     draws_latents  latent variables are drawn (one path a window, from its seed) instead of being at their mean
@@ -303,16 +304,11 @@ class MixtureModel:
     name: str
     uses_goal: bool = False
     draws_latents: bool = False
-    context: Context | None = None
     rows_at_once: int = 1024
 
     def fit(self, tracks: Detections) -> Self:
         """The model itself: it adapts to nothing."""
         return self
-
-    def placed(self, context: Context) -> Self:
-        """The model for the windows that `context` belongs to."""
-        return dataclasses.replace(self, context=context)
 
     @property
     def horizons(self) -> tuple[int, ...]:
@@ -321,17 +317,16 @@ class MixtureModel:
 
     @torch.no_grad()
     def mixture(self, windows: WindowBatch) -> GaussianMixture:
-        """The mixtures at the horizons, relative to the datum. Raises `ConfigError` for another grid, ValueError unplaced."""
+        """The mixtures at the horizons, relative to the datum. `ConfigError` for another grid."""
         context = self._check(windows)
         active = windows.is_active[:, 0].nonzero()[:, 0]
         parts = []
         for pick in torch.split(active, self.rows_at_once):
-            here = context[pick]
-            inputs = mixture_inputs(windows[pick], here, self.frame, self.network.history)
+            inputs = mixture_inputs(windows[pick], self.frame, self.network.history)
             if not self.uses_goal:
                 inputs = inputs.without_goal(torch.ones(len(inputs), dtype=torch.bool))
             noise = self._latent_noise(inputs, windows.seeds[pick]) if self.draws_latents else None
-            parts.append(self.network(inputs, noise).in_metres(self.frame, here.datum_m))
+            parts.append(self.network(inputs, noise).in_metres(self.frame, context.datum_m[pick]))
         return _scattered(parts, active, windows.num_windows, len(self.horizons))
 
     def sample(self, windows: WindowBatch, num_hypotheses: int) -> HypothesisSet:
@@ -351,9 +346,7 @@ class MixtureModel:
             )
         if windows.num_agents != 1:
             raise ValueError(f"MixtureModel: windows of {windows.num_agents} agents, expected one")
-        if self.context is None or len(self.context.datum_m) != windows.num_windows:
-            raise ValueError("MixtureModel: the windows have no place in the mission frame; use placed()")
-        return self.context
+        return windows.required_context("MixtureModel")
 
     def _latent_noise(self, inputs: MixtureInputs, seeds: Tensor) -> Tensor:
         r, n = inputs.is_observed.shape

@@ -20,7 +20,7 @@ from cadence.arrays import Float64s, Int64s
 from cadence.bank.rows import active_rows, scatter_hypotheses
 from cadence.recordings import Recordings
 from cadence.resampling import systematic
-from cadence.types import Context, Detections, HypothesisSet, WindowBatch
+from cadence.types import Detections, HypothesisSet, WindowBatch
 
 _BLOCK = 8
 """Steps over which speed and heading are measured: paths on a grid waver from step to step."""
@@ -148,10 +148,6 @@ class ParticleFilter:
 
     def fit(self, tracks: Detections) -> Self:
         """The filter itself: its motion comes from recordings."""
-        return self
-
-    def placed(self, context: Context) -> Self:
-        """The filter itself: it knows no places."""
         return self
 
     def sample(self, windows: WindowBatch, num_hypotheses: int) -> HypothesisSet:

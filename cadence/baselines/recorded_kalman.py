@@ -14,7 +14,7 @@ import torch
 from cadence.arrays import Int64s
 from cadence.baselines.kalman import ConstantVelocityKalman, OrnsteinUhlenbeckKalman
 from cadence.recordings import Recordings
-from cadence.types import Context, Detections, HypothesisSet, WindowBatch
+from cadence.types import Detections, HypothesisSet, WindowBatch
 
 _MAX_STRETCHES = 400
 
@@ -59,10 +59,6 @@ class RecordedKalman:
 
     def fit(self, tracks: Detections) -> Self:
         """The filter itself: it was fitted to recordings."""
-        return self
-
-    def placed(self, context: Context) -> Self:
-        """The filter itself: it knows no places."""
         return self
 
     def sample(self, windows: WindowBatch, num_hypotheses: int) -> HypothesisSet:

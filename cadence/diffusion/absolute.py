@@ -4,7 +4,6 @@ Ye, Natarajan, Wu, Gombolay, "Diffusion Models for Multi-target Adversarial Trac
 open is a switch here; the defaults are the paper's, except that detections are put in by the smoother (`inpainting`).
 """
 
-import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Literal, Self
@@ -117,24 +116,17 @@ class AbsoluteModel:
     """A trained network as an `Estimator`.
 
     It fills every step of its grid (`config.history_steps`, `config.horizon_steps`) and takes no other. Agents without
-    detections are NaN. `obstacles` lie in the mission frame; `context` is needed unless the model is relative and
-    unguided (`placed`).
+    detections are NaN. The windows must say where they are unless the model is relative and unguided.
     """
 
     network: TrajectoryNetwork
     config: AbsoluteConfig
     sampling: AbsoluteSampling = field(default_factory=AbsoluteSampling)
-    context: Context | None = None
-    obstacles: Obstacles = field(default_factory=Obstacles.none)
     name: str = "absolute"
 
     def fit(self, tracks: Detections) -> Self:
         """The model itself: it adapts to nothing."""
         return self
-
-    def placed(self, context: Context, obstacles: Obstacles | None = None) -> "AbsoluteModel":
-        """The model for the windows of one mission."""
-        return dataclasses.replace(self, context=context, obstacles=obstacles or self.obstacles)
 
     @torch.no_grad()
     def sample(self, windows: WindowBatch, num_hypotheses: int) -> HypothesisSet:
@@ -147,7 +139,7 @@ class AbsoluteModel:
         for begin in range(0, len(seeds), per_chunk):
             pick = slice(begin, begin + per_chunk)
             rows = nodes[torch.arange(len(seeds))[pick]]
-            frame = absolute_frame(rows, window[pick], agent[pick], self.context, self.config)
+            frame = absolute_frame(rows, window[pick], agent[pick], windows.context, self.config)
             parts.append(self._sample_rows(frame, RowNoise(seeds[pick]), num_hypotheses))
         return scatter_hypotheses(torch.cat(parts), windows)
 
@@ -159,10 +151,8 @@ class AbsoluteModel:
                 f"infer.grid: this checkpoint predicts {config.network.num_steps} steps of {config.step_s:g} s only; set "
                 f"step_s = {config.step_s:g}, history_steps = {config.history_steps}, horizon_steps = {config.horizon_steps}"
             )
-        if self.context is not None and len(self.context.datum_m) != windows.num_windows:
-            raise ValueError(f"AbsoluteModel: a context of {len(self.context.datum_m)} windows for {windows.num_windows}")
-        if self.context is None and not (self.config.relative and self.sampling.guidance == "none"):
-            raise ValueError("AbsoluteModel: the windows have no place in the mission frame; use placed()")
+        if not (self.config.relative and self.sampling.guidance == "none"):
+            windows.required_context("AbsoluteModel")
 
     def _sample_rows(self, frame: "AbsoluteFrame", stream: "RowNoise", num_hypotheses: int) -> Tensor:
         """Hypotheses [R, K, T, 2] in metres relative to the datum."""
@@ -205,7 +195,7 @@ class AbsoluteModel:
 
     def _paper_guidance(self, frame: "AbsoluteFrame") -> Hook:
         """Algorithm 1 on the normalised mean; the cost is in metres, its step length in map units."""
-        cost = PaperCost(self.obstacles, unit_m=self.config.scale_m, offset_m=frame.datum_m[:, None, None])
+        cost = PaperCost(frame.obstacles, unit_m=self.config.scale_m, offset_m=frame.datum_m[:, None, None])
 
         def guided(mean: Tensor, angle: float) -> Tensor:
             return adam_guidance(
@@ -220,12 +210,13 @@ class AbsoluteModel:
 
 @dataclass(frozen=True, eq=False)
 class AbsoluteFrame:
-    """R rows: their detections, the normaliser's centre and the datum [R, 2], further inputs [R, 1, E]."""
+    """R rows: their detections, the normaliser's centre and the datum [R, 2], further inputs [R, 1, E], what is in the way."""
 
     nodes: Nodes
     centre_m: Tensor
     datum_m: Tensor
     extra: Tensor | None
+    obstacles: Obstacles
 
     def detection_rows(self, config: AbsoluteConfig) -> tuple[Tensor, Tensor]:
         """What the network reads of the detections: rows [R, N, 3] and which of them exist [R, N]."""
@@ -245,7 +236,8 @@ def absolute_frame(
     centre = torch.tensor(config.centre_m, dtype=torch.float64) - datum
     if config.relative:
         centre = nodes.position_m[rows, nodes.is_observed.sum(dim=1) - 1]
-    return AbsoluteFrame(nodes, centre, datum, _extra(window, agent, datum + centre, context, config))
+    obstacles = Obstacles.none() if context is None else context.obstacles
+    return AbsoluteFrame(nodes, centre, datum, _extra(window, agent, datum + centre, context, config), obstacles)
 
 
 def _extra(window: Tensor, agent: Tensor, centre_m: Tensor, context: Context | None, config: AbsoluteConfig) -> Tensor | None:
@@ -326,8 +318,8 @@ def detection_rows(age: Tensor, position: Tensor, is_observed: Tensor, keep: int
 
 def _constraints(model: AbsoluteModel, frame: "AbsoluteFrame") -> tuple[Constraint, ...]:
     found: list[Constraint] = []
-    if model.obstacles.count:
-        found.append(ObstacleConstraint(model.obstacles, model.sampling.margin_m, frame.datum_m[:, None, None]))
+    if frame.obstacles.count:
+        found.append(ObstacleConstraint(frame.obstacles, model.sampling.margin_m, frame.datum_m[:, None, None]))
     if model.sampling.max_speed_mps is not None:
         found.append(SpeedConstraint(model.sampling.max_speed_mps, model.config.step_s))
     return tuple(found)

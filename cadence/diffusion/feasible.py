@@ -1,6 +1,7 @@
 """Constraints on hypotheses: guidance of clean estimates while sampling, repair and weights at the end."""
 
 from dataclasses import dataclass
+from typing import Literal, Self
 
 import torch
 from torch import Tensor
@@ -11,9 +12,29 @@ from cadence.constraints.obstacles import ObstacleConstraint, Obstacles
 from cadence.constraints.repair import repair
 from cadence.diffusion.guidance import clean_estimate_guidance
 from cadence.resampling import systematic
+from cadence.types import WindowBatch
 
 _PINNED_SHARE = 0.05
 _LEAST_WEIGHT = 1e-3
+
+
+@dataclass(frozen=True)
+class GuidanceConfig:
+    """How constraints act on hypotheses.
+
+    mode           "clean" guides while sampling and repairs at the end; "repair" only repairs; "none" ignores constraints;
+                   of the scene preset only "none" counts (infer.scene says how it guides), and the paper preset has infer.paper
+    margin_m       distance to keep from obstacles
+    max_speed_mps  a speed that the target cannot exceed; None = no limit
+    """
+
+    mode: Literal["clean", "repair", "none"] = "clean"
+    margin_m: float = 0.0
+    max_speed_mps: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.margin_m < 0 or (self.max_speed_mps is not None and not self.max_speed_mps > 0):
+            raise ValueError("margin_m must not be negative, max_speed_mps must be positive")
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,6 +54,21 @@ class Feasibility:
     step_s: float
     offset_m: Tensor
     num_steps: int = 3
+
+    @classmethod
+    def of(cls, windows: WindowBatch, config: GuidanceConfig) -> Self:
+        """What the active agents of windows, one a row, must obey; without a context there are no obstacles."""
+        window = windows.is_active.nonzero()[:, 0]
+        context = windows.context
+        datum_m = torch.zeros(windows.num_windows, 2, dtype=torch.float64) if context is None else context.datum_m
+        obstacles = Obstacles.none() if context is None else context.obstacles
+        offset_m = datum_m[window, None, None]
+        return cls(obstacles, config.margin_m, config.max_speed_mps, windows.step_s, offset_m)
+
+    @property
+    def is_limited(self) -> bool:
+        """Whether there is anything to obey."""
+        return self.obstacles.count > 0 or self.max_speed_mps is not None
 
     def guide(self, position_m: Tensor, sigma_m: Tensor, rows: slice) -> Tensor:
         """Clean estimates [R', K, T, 2] moved towards the feasible, as far as the bank is uncertain there."""

@@ -6,13 +6,15 @@ the bank's own uncertainty, which vanishes where something was seen.
 
 import dataclasses
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Literal
 
 import torch
 from torch import Tensor
 
 from cadence.bank.bank import Bank, BankPosterior
-from cadence.bank.rows import active_rows, scatter_hypotheses
+from cadence.bank.rows import active_rows, scatter_hypotheses, with_status
+from cadence.diffusion.feasible import Feasibility, GuidanceConfig, resampled
 from cadence.diffusion.residual import ResidualContext, build_context
 from cadence.diffusion.sampler import even_angles, sample_ddim, sample_dpmpp_2m, sample_rotation
 from cadence.diffusion.schedule import clean_from
@@ -20,6 +22,7 @@ from cadence.network.residual import ResidualNetwork
 from cadence.types import Detections, HypothesisSet, WindowBatch
 
 _SAMPLERS = {"rotation": sample_rotation, "ddim": sample_ddim, "dpmpp": sample_dpmpp_2m}
+SamplerName = Literal["rotation", "ddim", "dpmpp"]
 _MAX_BATCH = 960
 _RAMP_STEPS = 8.0
 
@@ -42,13 +45,13 @@ class GateScores:
 
 @dataclass(frozen=True, eq=False)
 class GeneralModel:
-    """Bank and residual network; `sample` draws joint hypotheses of past and future.
+    """Bank and residual network; `sample` draws joint hypotheses of past and future that keep the constraints.
 
     bank       fitted to the log
     network    trained; without one the bank's samples are returned as they are
     sampler    "rotation", "ddim" or "dpmpp"
     num_steps  evaluations of the network for each hypothesis
-    guide      moves clean estimates, or None
+    guidance   how constraints act: a speed limit, and the obstacles of the windows' context
     share_past, share_future  share of the hypotheses that the network moves, up to the origin and after it; the others stay
                samples of the bank
     bf16       network in bfloat16: about twice as fast where the processor knows it
@@ -58,9 +61,9 @@ class GeneralModel:
 
     bank: Bank
     network: ResidualNetwork | None
-    sampler: str = "rotation"
+    sampler: SamplerName = "rotation"
     num_steps: int = 6
-    guide: CleanHook | None = None
+    guidance: GuidanceConfig = field(default_factory=GuidanceConfig)
     share_past: float = 1.0
     share_future: float = 1.0
     bf16: bool = False
@@ -73,29 +76,64 @@ class GeneralModel:
         return dataclasses.replace(self, bank=self.bank.fit(tracks, step_s))
 
     def sample(self, windows: WindowBatch, num_hypotheses: int) -> HypothesisSet:
-        """Draw hypotheses for every active agent; deterministic in the windows' seeds."""
-        rows, _ = active_rows(windows)
+        """Draw hypotheses for every active agent; deterministic in the windows' seeds.
+
+        The status of an agent is "guidance_diverged" where samples of the bank had to stand in, "infeasible" where a
+        hypothesis could not be led out of an obstacle.
+        """
+        limits = Feasibility.of(windows, self.guidance)
         posterior = self.bank.posterior(windows, num_hypotheses)
-        if self.network is None or len(rows.time_s) == 0 or self.share_past == self.share_future == 0.0:
-            return scatter_hypotheses(posterior.sample_m, windows)
+        sample_m = self.denoised(posterior, windows, limits.guide if self._guides(limits) else None)
+        is_finite = torch.isfinite(sample_m).flatten(1).all(1)
+        sample_m = torch.where(is_finite[:, None, None, None], sample_m, posterior.sample_m)
+        drawn = scatter_hypotheses(sample_m, windows)
+        if self.guidance.mode == "none" or not len(sample_m):
+            return with_status(drawn, windows, ~is_finite, torch.zeros_like(is_finite))
+        kept_m, row_weight, is_feasible = limits.finish(
+            sample_m, self._sigma_m(windows, limits), self.bank.length_m(windows.step_s)
+        )
+        weight = drawn.weight
+        if windows.num_agents == 1:
+            weight = weight.clone()
+            weight[windows.is_active[:, 0]] = row_weight
+        else:
+            kept_m = resampled(kept_m, row_weight, active_rows(windows)[1])
+        kept = HypothesisSet(scatter_hypotheses(kept_m, windows).position_m, weight, drawn.status)
+        return with_status(kept, windows, ~is_finite, ~is_feasible.all(1))
+
+    def _guides(self, limits: Feasibility) -> bool:
+        return self.guidance.mode == "clean" and limits.is_limited
+
+    def _sigma_m(self, windows: WindowBatch, limits: Feasibility) -> Tensor:
+        """How sure the bank is of every step [R, T]; of no matter where nothing is repaired."""
+        if limits.obstacles.count:
+            return self.bank.posterior(windows, 1).sigma_m
+        return torch.ones(int(windows.is_active.sum()), windows.num_steps)
+
+    def denoised(self, posterior: BankPosterior, windows: WindowBatch, guide: CleanHook | None = None) -> Tensor:
+        """The bank's samples as the network moves them [R, K, T, 2], clean estimates led by `guide`; no repair."""
+        if self.network is None or len(posterior.sample_m) == 0 or self.share_past == self.share_future == 0.0:
+            return posterior.sample_m
+        rows, _ = active_rows(windows)
         length_m = self.bank.length_m(windows.step_s)
         context = build_context(posterior, rows, windows.time_s, windows.step_s, length_m)
-        residual = self._denoise(posterior, context)
-        position = posterior.mean_m[:, None] + posterior.sigma_m[:, None, :, None] * residual.double()
-        return scatter_hypotheses(position, windows)
+        residual = self._denoise(posterior, context, guide)
+        return posterior.mean_m[:, None] + posterior.sigma_m[:, None, :, None] * residual.double()
 
     @torch.inference_mode()
-    def _denoise(self, posterior: BankPosterior, context: ResidualContext) -> Tensor:
+    def _denoise(self, posterior: BankPosterior, context: ResidualContext, guide: CleanHook | None) -> Tensor:
         noise = ((posterior.sample_m - posterior.mean_m[:, None]) / posterior.sigma_m[:, None, :, None]).float()
         num_rows, num_hypotheses = noise.shape[:2]
         chunk = max(1, _MAX_BATCH // num_hypotheses)
         parts = [
-            self._denoise_rows(noise[begin : begin + chunk], context[begin : begin + chunk], posterior, begin)
+            self._denoise_rows(noise[begin : begin + chunk], context[begin : begin + chunk], posterior, begin, guide)
             for begin in range(0, num_rows, chunk)
         ]
         return torch.cat(parts)
 
-    def _denoise_rows(self, noise: Tensor, context: ResidualContext, posterior: BankPosterior, begin: int) -> Tensor:
+    def _denoise_rows(
+        self, noise: Tensor, context: ResidualContext, posterior: BankPosterior, begin: int, guide: CleanHook | None
+    ) -> Tensor:
         network = self.network
         assert network is not None
         num_rows, num_hypotheses = noise.shape[:2]
@@ -112,16 +150,16 @@ class GeneralModel:
                 velocity = part * network(state, level, wide, code).float()
             return clean_from("v", velocity, state, torch.tensor(angle))
 
-        def guide(clean: Tensor, angle: float) -> Tensor:
-            if self.guide is None:
+        def guided(clean: Tensor, angle: float) -> Tensor:
+            if guide is None:
                 return clean
             scale = sigma[:, None, :, None]
             position = mean + scale * clean.view(num_rows, num_hypotheses, -1, 2).cpu().double()
-            moved = (self.guide(position, sigma, rows) - mean) / scale
+            moved = (guide(position, sigma, rows) - mean) / scale
             return moved.float().flatten(0, 1).to(clean.device)
 
         start = noise.flatten(0, 1).to(self.device)
-        result = _SAMPLERS[self.sampler](denoise, start, even_angles(self.num_steps), guide)
+        result = _SAMPLERS[self.sampler](denoise, start, even_angles(self.num_steps), guided)
         return result.cpu().view(num_rows, num_hypotheses, -1, 2)
 
     def _part(self, num_hypotheses: int, context: ResidualContext) -> Tensor:

@@ -4,7 +4,6 @@ Like the paper's model (Ye et al., CADENCE, MRS 2023) it predicts from now on; u
 the last detection, so that detections need no inpainting, and the stretch since then is part of every hypothesis.
 """
 
-import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Literal, Self
@@ -13,7 +12,7 @@ import torch
 from torch import Tensor
 
 from cadence.bank.rows import scatter_hypotheses
-from cadence.constraints.obstacles import ObstacleConstraint, Obstacles
+from cadence.constraints.obstacles import ObstacleConstraint
 from cadence.constraints.repair import repair
 from cadence.diffusion.guidance import PaperCost, adam_guidance, clean_estimate_guidance
 from cadence.diffusion.noise import RowNoise
@@ -80,17 +79,15 @@ class SceneSampling:
 
 @dataclass(frozen=True, eq=False)
 class SceneModel:
-    """A trained network as an `Estimator` for windows that begin now; `placed` binds their context.
+    """A trained network as an `Estimator` for windows that begin now and say where they are (`WindowBatch.context`).
 
     Networks with attention draw all agents of a window together, others each agent for itself; agents without detections are
-    NaN. `obstacles` lie in the mission frame.
+    NaN.
     """
 
     network: SceneNetwork
     config: SceneConfig
     sampling: SceneSampling = field(default_factory=SceneSampling)
-    context: Context | None = None
-    obstacles: Obstacles = field(default_factory=Obstacles.none)
     name: str = "cadence"
 
     @property
@@ -102,18 +99,13 @@ class SceneModel:
         """The model itself: it adapts to nothing."""
         return self
 
-    def placed(self, context: Context, obstacles: Obstacles | None = None) -> "SceneModel":
-        """The model for windows with this context."""
-        return dataclasses.replace(self, context=context, obstacles=obstacles or self.obstacles)
-
     @torch.no_grad()
     def sample(self, windows: WindowBatch, num_hypotheses: int) -> HypothesisSet:
         """Hypotheses [B, K, A, T, 2]; a window's depend on its seed, not on its neighbours. `ConfigError` for other grids."""
         self._check(windows)
-        assert self.context is not None
         if self.config.shared_gap_steps:
             windows = shared_detections(windows)
-        rows = agent_rows(windows, self.context, self.config)
+        rows = agent_rows(windows, self.config)
         network = FrozenScene(self.network, getattr(torch, self.sampling.precision))
         size = rows.team.num_agents if rows.team is not None else 1  # rows that belong together
         per_chunk = size * max(1, self.sampling.chunk // (num_hypotheses * size))
@@ -121,7 +113,7 @@ class SceneModel:
         for begin in range(0, rows.windows.num_windows, per_chunk):
             part = slice(begin, begin + per_chunk)
             team = rows.team and rows.team[slice(begin // size, (begin + per_chunk) // size)]
-            parts.append(self._sample_rows(network, rows.windows[part], rows.context[part], team, num_hypotheses))
+            parts.append(self._sample_rows(network, rows.windows[part], team, num_hypotheses))
         return scatter_hypotheses(torch.cat(parts)[rows.is_real], windows)
 
     def _check(self, windows: WindowBatch) -> None:
@@ -141,17 +133,14 @@ class SceneModel:
                 f"infer.checkpoint: this checkpoint draws at most {MAX_AGENTS} agents together, here are {windows.num_agents}; "
                 "choose one without attention between agents, such as 'general'"
             )
-        if self.context is None or len(self.context.datum_m) != windows.num_windows:
-            raise ValueError("SceneModel: the windows need a context of their own; use placed()")
 
-    def _sample_rows(
-        self, network: FrozenScene, windows: WindowBatch, context: Context, team: Team | None, num_hypotheses: int
-    ) -> Tensor:
+    def _sample_rows(self, network: FrozenScene, windows: WindowBatch, team: Team | None, num_hypotheses: int) -> Tensor:
         """Hypotheses [R, K, T, 2] in metres relative to the datum."""
-        inputs = scene_inputs(windows, context, self.config)
+        context = windows.required_context("SceneModel")
+        inputs = scene_inputs(windows, self.config)
         stream = RowNoise(windows.seeds)
         last_m = _last_detection(windows.detections)
-        tracks = _Tracks(self, inputs.pieces, last_m, context.datum_m)
+        tracks = _Tracks(self, inputs.pieces, last_m, context)
         pieces = inputs.pieces.repeated(num_hypotheses)
         known = network.known(inputs)
         mates = None if team is None else team.repeated(num_hypotheses)
@@ -169,11 +158,11 @@ class SceneModel:
         sampled = tracks.guided(tracks.limited(sampled), "final")
         positions = future_of(to_track(sampled.double(), inputs.pieces, self.config), self.config)
         positions = positions + last_m[:, None, None]
-        if self.obstacles.count and self.sampling.is_repaired:
+        if context.obstacles.count and self.sampling.is_repaired:
             is_pinned = torch.zeros(positions.shape[:-1], dtype=torch.bool)
             is_pinned[..., 0] = (inputs.pieces.start[:, :1] >= 0).expand(-1, num_hypotheses)
             offset = context.datum_m[:, None, None]
-            positions, _ = repair(positions, self.obstacles, is_pinned, self.sampling.margin_m, offset_m=offset)
+            positions, _ = repair(positions, context.obstacles, is_pinned, self.sampling.margin_m, offset_m=offset)
         return positions
 
     def _solved(self, denoise: Callable[[Tensor, float], Tensor], start: Tensor, stream: RowNoise, tracks: "_Tracks") -> Tensor:
@@ -191,10 +180,10 @@ class SceneModel:
 class _Tracks:
     """What moves the pieces [R, K, P, 2] of one chunk of windows: the speed limit, and obstacles."""
 
-    def __init__(self, model: SceneModel, pieces: Pieces, last_m: Tensor, datum_m: Tensor) -> None:
-        self.config, self.sampling, self.obstacles = model.config, model.sampling, model.obstacles
+    def __init__(self, model: SceneModel, pieces: Pieces, last_m: Tensor, context: Context) -> None:
+        self.config, self.sampling, self.obstacles = model.config, model.sampling, context.obstacles
         self.pieces, self.last_m = pieces, last_m[:, None, None].float()
-        self.offset_m = datum_m[:, None, None].float()
+        self.offset_m = context.datum_m[:, None, None].float()
         # how far a target may have come since the detection: what guidance may move a track by
         self.reach_m = torch.nn.functional.pad((pieces.span * self.config.scale_m).cumsum(dim=1), (1, 0))[:, None, :, None]
 

@@ -75,8 +75,9 @@ class SceneConfig:
         return SceneNetwork(self.network, NUM_ROW, NUM_SUMMARY, NUM_TRACKER)
 
 
-def scene_inputs(windows: WindowBatch, context: Context, config: SceneConfig) -> SceneInputs:
+def scene_inputs(windows: WindowBatch, config: SceneConfig) -> SceneInputs:
     """What the network is told of windows with one agent each, all with at least one detection [R = B]."""
+    context = windows.required_context("scene_inputs")
     if windows.num_agents != 1 or not bool(windows.is_active.all()):
         raise ValueError("scene_inputs: windows of one agent with at least one detection each are needed")
     seen = _Seen(windows.detections, context, config)

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from cadence.diffusion.scene_frame import SceneConfig
 from cadence.network.attention import Team
-from cadence.types import Context, Detections, WindowBatch
+from cadence.types import Detections, WindowBatch
 
 _AGENT_SEED = 7_919
 
@@ -16,21 +16,20 @@ _AGENT_SEED = 7_919
 class AgentRows:
     """R rows, one agent each.
 
-    windows, context  of one agent; every row has a detection
+    windows           of one agent, with their context; every row has a detection
     window, agent     [R] what a row stands for
     is_real           [R] bool; the other rows stand for absent agents, with the detections of somebody else
     team              which rows see each other; None: none do
     """
 
     windows: WindowBatch
-    context: Context
     window: Tensor
     agent: Tensor
     is_real: Tensor
     team: Team | None
 
 
-def agent_rows(windows: WindowBatch, context: Context, config: SceneConfig) -> AgentRows:
+def agent_rows(windows: WindowBatch, config: SceneConfig) -> AgentRows:
     """Every agent of every window of which anything is known.
 
     Without attention these are the agents with detections, each for itself. With it, all agents of windows with any detection,
@@ -39,7 +38,7 @@ def agent_rows(windows: WindowBatch, context: Context, config: SceneConfig) -> A
     active = windows.is_active
     if not config.network.attention_heads:
         window, agent = active.nonzero(as_tuple=True)
-        return _rows(windows, context, window, agent, agent, torch.ones_like(agent, dtype=torch.bool), None)
+        return _rows(windows, window, agent, agent, torch.ones_like(agent, dtype=torch.bool), None)
     kept = active.any(dim=1).nonzero()[:, 0]
     is_present = active[kept]
     window = kept.repeat_interleave(windows.num_agents)
@@ -47,19 +46,19 @@ def agent_rows(windows: WindowBatch, context: Context, config: SceneConfig) -> A
     # somebody else's detections in place of none: such rows are computed, seen by nobody, and thrown away
     somebody = is_present.to(torch.int64).argmax(dim=1).repeat_interleave(windows.num_agents)
     is_real = is_present.flatten()
-    return _rows(windows, context, window, agent, torch.where(is_real, agent, somebody), is_real, Team(is_present))
+    return _rows(windows, window, agent, torch.where(is_real, agent, somebody), is_real, Team(is_present))
 
 
-def _rows(
-    windows: WindowBatch, context: Context, window: Tensor, agent: Tensor, source: Tensor, is_real: Tensor, team: Team | None
-) -> AgentRows:
+def _rows(windows: WindowBatch, window: Tensor, agent: Tensor, source: Tensor, is_real: Tensor, team: Team | None) -> AgentRows:
     d = windows.detections
     columns = (d.time_s, d.position_m, d.covariance_m2, d.is_observed)
     seeds = windows.seeds[window] + _AGENT_SEED * agent
-    rows = WindowBatch(windows.time_s, Detections(*(value[window, source][:, None] for value in columns)), seeds, 0)
+    context = windows.required_context("agent_rows")
     goal = context.known_goal_m
     mine = dataclasses.replace(context[window], known_goal_m=None if goal is None else goal[window, source][:, None])
-    return AgentRows(rows, mine, window, agent, is_real, team)
+    detections = Detections(*(value[window, source][:, None] for value in columns))
+    rows = WindowBatch(windows.time_s, detections, seeds, 0, mine)
+    return AgentRows(rows, window, agent, is_real, team)
 
 
 def shared_detections(windows: WindowBatch) -> WindowBatch:
@@ -76,4 +75,4 @@ def shared_detections(windows: WindowBatch) -> WindowBatch:
         is_observed.gather(2, order),
     )
     everybody = Detections(*(value.expand(b, a, *value.shape[2:]) for value in vars(merged).values()))
-    return WindowBatch(windows.time_s, everybody, windows.seeds, windows.origin_index)
+    return dataclasses.replace(windows, detections=everybody)

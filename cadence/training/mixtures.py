@@ -32,7 +32,7 @@ def mixture_windows(
     """Forecasting windows as a network sees them."""
     centre = torch.tensor(frame.centre_m, dtype=torch.float64)
     place_m = windows.truth_m[:, 0, list(horizons)] + windows.context.datum_m[:, None]
-    inputs = mixture_inputs(windows.windows, windows.context, frame, history)
+    inputs = mixture_inputs(windows.windows, frame, history)
     return MixtureWindows(inputs, ((place_m - centre) / frame.scale_m).float())
 
 

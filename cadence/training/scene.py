@@ -1,7 +1,7 @@
 """Training of scene networks: windows out of recordings, the diffusion loss, and the energy score of a few-step sampler."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -15,7 +15,6 @@ from cadence.diffusion.schedule import MAX_ANGLE, clean_from
 from cadence.network.attention import Team
 from cadence.network.scene import Pieces, SceneInputs, SceneNetwork
 from cadence.recordings import NUM_STEPS, Recordings, cut_windows
-from cadence.types import Context
 
 _LEAST_ANGLE = 0.01
 _LOCAL_SCALE = 0.05
@@ -77,15 +76,14 @@ def scene_windows(
     cut = cut_windows(recordings, episode, step, known_start=has_start)
     context = cut.context
     assert context.known_goal_m is not None and context.tracker_m is not None
-    context = Context(
-        context.datum_m,
-        context.elapsed_s,
-        context.known_goal_m.masked_fill(torch.from_numpy(~has_goal)[:, None, None], torch.nan),
-        context.tracker_m.masked_fill(torch.from_numpy(~has_trackers)[:, None, None, None], torch.nan),
+    told_context = replace(
+        context,
+        known_goal_m=context.known_goal_m.masked_fill(torch.from_numpy(~has_goal)[:, None, None], torch.nan),
+        tracker_m=context.tracker_m.masked_fill(torch.from_numpy(~has_trackers)[:, None, None, None], torch.nan),
     )
-    told_windows = shared_detections(cut.windows) if config.shared_gap_steps else cut.windows
-    found = agent_rows(told_windows, context, config)
-    inputs = scene_inputs(found.windows, found.context, config)
+    told_windows = (shared_detections(cut.windows) if config.shared_gap_steps else cut.windows).with_context(told_context)
+    found = agent_rows(told_windows, config)
+    inputs = scene_inputs(found.windows, config)
     track = episode[found.window] * recordings.num_agents + found.agent.numpy()
     now = recordings.offset[track] + step[found.window]
     track_m = recorded_track(recordings, now, track, inputs.pieces)

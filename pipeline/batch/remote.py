@@ -19,7 +19,8 @@ from pathlib import Path
 from typing import Any, Final, Literal
 
 from cadence.errors import CadenceError, DeviceError
-from pipeline.batch.tasks import LogOutcome, LogTask, run_task
+from pipeline.batch.outcome import LogOutcome, LogTask
+from pipeline.batch.tasks import run_task
 from pipeline.config import config_as_dict
 from pipeline.locks import locked
 from pipeline.manifest import StageResult, hash_file, manifest_path, read_manifest, write_atomic

@@ -16,13 +16,16 @@ from typing import Literal
 from tqdm import tqdm
 
 from cadence.errors import CadenceError, UsageError
+from pipeline.batch.config import RunConfig
 from pipeline.batch.engines.local import run_in_processes, run_in_sequence
 from pipeline.batch.engines.ray import run_on_ray
+from pipeline.batch.outcome import LogOutcome, LogTask, exit_code
 from pipeline.batch.remote import SOURCE_NAME, run_anywhere, write_text
 from pipeline.batch.summaries import batch_record, to_json
-from pipeline.batch.tasks import STAGES, Engine, LogOutcome, LogTask, RunConfig, exit_code, plan_tasks, run_tasks
-from pipeline.ingest.stage import CATALOGUE_NAME, Catalogue, read_catalogue
+from pipeline.batch.tasks import STAGES, Engine, plan_tasks, run_tasks
+from pipeline.catalogue import Catalogue, read_catalogue
 from pipeline.manifest import hash_file, manifest_path
+from pipeline.missions import CATALOGUE_NAME
 from pipeline.progress import Progress, Told
 from pipeline.stores.urls import is_url
 

@@ -4,24 +4,19 @@ import dataclasses
 import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import Any, get_args
 
 from cadence.errors import ImplausibleInputError, PartialInputError
+from pipeline.batch.outcome import LogOutcome, Status
 from pipeline.extract.plausibility import suspicions_in
 from pipeline.manifest import StageResult
 from pipeline.stores.urls import shown
-
-if TYPE_CHECKING:
-    from pipeline.batch.tasks import LogOutcome
 
 SHOWN_STAGES = ("export", "report")
 """Whose files a person wants to open; the others are intermediate."""
 
 MAX_LOGS_WITH_FILES = 3
 """With more logs than this the files of each are not listed."""
-
-Status = Literal["done", "skipped", "partial", "doubtful", "nothing detected", "failed"]
-"""What became of a log; batch.json counts each."""
 
 BATCH_VERSION = 1
 """Version of batch.json."""
@@ -60,7 +55,7 @@ def score_lines(scores: Sequence[Mapping[str, Any]]) -> list[str]:
     return ["  " + "  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in rows if scores]
 
 
-def log_record(outcome: "LogOutcome") -> dict[str, Any]:
+def log_record(outcome: LogOutcome) -> dict[str, Any]:
     """The outcome of one log of `cadence run` for programs."""
     error = {"message": outcome.message, "exit_code": outcome.exit_code} if outcome.exit_code else None
     task = outcome.task
@@ -71,7 +66,7 @@ def log_record(outcome: "LogOutcome") -> dict[str, Any]:
     }  # fmt: skip
 
 
-def batch_record(outcomes: Sequence["LogOutcome"], exit_code: int, elapsed_s: float) -> dict[str, Any]:
+def batch_record(outcomes: Sequence[LogOutcome], exit_code: int, elapsed_s: float) -> dict[str, Any]:
     """A batch for programs: batch.json."""
     counts = Counter(outcome.status for outcome in outcomes)
     return {
@@ -84,7 +79,7 @@ def batch_record(outcomes: Sequence["LogOutcome"], exit_code: int, elapsed_s: fl
     }
 
 
-def batch_summary(outcomes: Sequence["LogOutcome"]) -> str:
+def batch_summary(outcomes: Sequence[LogOutcome]) -> str:
     """A table with a row a log, what was lost and what is suspected, and the files to look at where they are few."""
     numbers = ("num_windows", "num_agents", "num_detections")
     rows = [("log", "status", "windows", "agents", "detections", "time", "")]

@@ -6,105 +6,26 @@ Where tasks run is decided by an engine (`pipeline/engines`).
 import contextlib
 import time
 import traceback
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Generator, Iterator, Sequence
 from pathlib import Path
 
 import torch
 
-from cadence.errors import CadenceError, DeviceError, ImplausibleInputError, NothingDetectedError, PartialInputError
-from pipeline.batch.summaries import Status
-from pipeline.export.stage import ExportConfig, export
-from pipeline.extract.plausibility import suspicions_in
-from pipeline.extract.stage import ExtractConfig, extract
-from pipeline.infer.stage import InferConfig, infer
-from pipeline.ingest.stage import IngestConfig, ingest
+from cadence.errors import CadenceError, DeviceError, NothingDetectedError
+from pipeline.batch.config import RunConfig
+from pipeline.batch.outcome import LogOutcome, LogTask, is_damaged
+from pipeline.estimators.presets import refuse_unread
+from pipeline.export.stage import export
+from pipeline.extract.stage import extract
+from pipeline.infer.stage import infer
+from pipeline.ingest.stage import ingest
 from pipeline.locks import locked
 from pipeline.manifest import StageResult
 from pipeline.missions import find_missions
 from pipeline.progress import Progress, Told
-from pipeline.report.stage import ReportConfig, report
-from pipeline.stores.urls import shown
+from pipeline.report.stage import report
 
 STAGES = ("ingest", "extract", "infer", "export", "report")
-
-
-@dataclass(frozen=True)
-class RunConfig:
-    """The configuration of every stage of `cadence run`: the tables [ingest], [extract], [infer], [export], [report]."""
-
-    ingest: IngestConfig = field(default_factory=IngestConfig)
-    extract: ExtractConfig = field(default_factory=ExtractConfig)
-    infer: InferConfig = field(default_factory=InferConfig)
-    export: ExportConfig = field(default_factory=ExportConfig)
-    report: ReportConfig = field(default_factory=ReportConfig)
-
-
-@dataclass(frozen=True)
-class LogTask:
-    """One mission to be run.
-
-    index       its place in the order of the user
-    parts       its log, or the parts of a split one in the order of the recording: paths or URLs
-    directory   its mission directory: path or URL
-    size_bytes  of all parts; 0 where unknown
-    """
-
-    index: int
-    parts: tuple[str, ...]
-    directory: str
-    size_bytes: int
-    config: RunConfig
-    force: bool = False
-
-    @property
-    def log(self) -> str:
-        """Its log, or the first part of it, as it may be shown."""
-        return shown(self.parts[0])
-
-    @property
-    def name(self) -> str:
-        """What the mission is called: the last part of its directory."""
-        return self.directory.rstrip("/").rpartition("/")[2]
-
-
-@dataclass(frozen=True)
-class LogOutcome:
-    """What became of one log.
-
-    stages     results in the order of the pipeline, up to the first failure
-    message    why there are no results, in one line; else empty
-    exit_code  of the failure: 1 marks a defect of this program, whose traceback is in `trace`; 0 where it went through, or
-               nothing was detected in a log that is whole
-    elapsed_s  how long it took
-    """
-
-    task: LogTask
-    stages: tuple[StageResult, ...] = ()
-    message: str = ""
-    exit_code: int = 0
-    elapsed_s: float = 0.0
-    trace: str = ""
-
-    @property
-    def status(self) -> Status:
-        """What became of the log.
-
-        failed; nothing detected: no results; doubtful: they rest on a suspicion, whether or not the log is damaged as well;
-        partial: they rest on a damaged log; skipped: all was done before; done.
-        """
-        if self.message:
-            return "failed" if self.exit_code else "nothing detected"
-        if self.suspicions:
-            return "doubtful"
-        if _is_damaged(self.stages):
-            return "partial"
-        return "skipped" if all(stage.status == "skipped" for stage in self.stages) else "done"
-
-    @property
-    def suspicions(self) -> tuple[str, ...]:
-        """What in the log cannot be meant as it stands, a sentence each."""
-        return tuple(line for stage in self.stages for line in suspicions_in(stage.summary))
 
 
 RunTask = Callable[[LogTask, Progress], LogOutcome]
@@ -119,7 +40,11 @@ the generator early stops the workers."""
 
 
 def plan_tasks(logs: Sequence[str], out: str, config: RunConfig, force: bool = False) -> tuple[LogTask, ...]:
-    """One task for each mission among `logs`: files, folders, patterns or URLs, in their order. See `find_missions`."""
+    """One task for each mission among `logs`: files, folders, patterns or URLs, in their order. See `find_missions`.
+
+    A checkpoint that is not there, or settings that it does not read, are a `ConfigError` before the first stage begins.
+    """
+    refuse_unread(config.infer.checkpoint, config.infer)
     return tuple(
         LogTask(index, mission.parts, mission.directory, mission.size_bytes, config, force)
         for index, mission in enumerate(find_missions(logs, out))
@@ -137,7 +62,7 @@ def run_task(task: LogTask, progress: Progress) -> LogOutcome:
             for number, stage in enumerate(_RUNS):
                 finished.append(stage(task, progress.part(number / len(_RUNS), (number + 1) / len(_RUNS))))
     except NothingDetectedError as error:  # of a damaged log nobody knows: detections may be lost
-        message, code = _naming(task, str(error)), error.exit_code * _is_damaged(finished)
+        message, code = _naming(task, str(error)), error.exit_code * is_damaged(finished)
     except CadenceError as error:
         message, code = _naming(task, str(error)), error.exit_code
     except MemoryError:
@@ -161,35 +86,6 @@ def run_tasks(
             outcomes[outcome.task.index] = outcome
             on_outcome(outcome)
     return tuple(outcomes[task.index] for task in tasks)
-
-
-def exit_code(outcomes: Sequence[LogOutcome]) -> int:
-    """The highest code of the failures; without any 8 where something is suspected, else 7 where a log is damaged.
-
-    3 where nothing was detected in any; else 0. Suspicion counts more than damage: a gap is seen as a gap, a wrong place is
-    believed.
-    """
-    if any(outcome.exit_code for outcome in outcomes):
-        return max(outcome.exit_code for outcome in outcomes)
-    if any(outcome.status == "doubtful" for outcome in outcomes):
-        return ImplausibleInputError.exit_code
-    if any(outcome.status == "partial" for outcome in outcomes):
-        return PartialInputError.exit_code
-    return NothingDetectedError.exit_code if _is_nothing_detected(outcomes) else 0
-
-
-def complaints(outcomes: Sequence[LogOutcome]) -> list[str]:
-    """A line for each failure; that nothing was detected in a log is one only where nothing was detected in any."""
-    return [outcome.message for outcome in outcomes if outcome.exit_code or _is_nothing_detected(outcomes)]
-
-
-def _is_damaged(stages: Iterable[StageResult]) -> bool:
-    """Whether one of the stages worked on a log of which a part is lost."""
-    return any(stage.summary.get("is_complete") is False for stage in stages)
-
-
-def _is_nothing_detected(outcomes: Sequence[LogOutcome]) -> bool:
-    return bool(outcomes) and all(outcome.status == "nothing detected" for outcome in outcomes)
 
 
 def _naming(task: LogTask, message: str) -> str:

@@ -14,10 +14,10 @@ import pyarrow.compute as pc
 from cadence.errors import InputError
 from cadence.recordings import Recordings
 from pipeline.arrays import Float64s, Int64s
-from pipeline.extract.obstacle_sources import OBSTACLES_NAME
 from pipeline.extract.stage import ExtractConfig, write_tables
 from pipeline.logs.reader import MissionLog, open_log
 from pipeline.mapping.guess import suggest_mapping
+from pipeline.obstacle_file import OBSTACLES_NAME
 from pipeline.progress import Progress
 from pipeline.tables import read_table
 from pipeline.windows import UNKNOWN_AGENT

@@ -19,12 +19,11 @@ from cadence.errors import CadenceError, DeviceError, InputError
 from cadence.recordings import Recordings
 from pipeline.config import config_as_dict
 from pipeline.episodes.recorded_logs import Gridding, LogEpisodes, read_log_episodes
-from pipeline.extract.obstacle_sources import as_obstacles
 from pipeline.extract.stage import ExtractConfig
 from pipeline.manifest import hash_file
+from pipeline.obstacle_file import as_obstacles, obstacles_as_json
 from pipeline.progress import Progress
 from pipeline.provenance import versions
-from pipeline.simulate.mission_log import obstacles_as_json
 
 BLOCK = 500
 """Simulated episodes a file of the cache."""

@@ -20,18 +20,17 @@ from torch import Tensor
 from cadence.constraints.checker import segments_in_collision, states_in_collision
 from cadence.errors import CadenceError, InputError, UsageError
 from cadence.types import Estimator, HypothesisSet, WindowBatch
-from pipeline.config import read_config
+from pipeline.associations import Association, Sources, build_way_windows
+from pipeline.estimators.fitting import FittingData
 from pipeline.evaluate.joint import JointCells, JointScorer
 from pipeline.evaluate.matching import match_to_truth, matched_windows
-from pipeline.evaluate.rivals import RIVALS, FittingData
+from pipeline.evaluate.rivals import RIVALS
 from pipeline.evaluate.scores import Cells, Draw, IsInside, score_in_chunks
 from pipeline.evaluate.tables import OWN_NAME, ScoredMission, as_csv, as_json, as_markdown, headline, pool
-from pipeline.extract.obstacle_sources import OBSTACLES_NAME, read_obstacles
 from pipeline.forecast.stage import ForecastConfig, evaluate_forecasts
-from pipeline.infer.stage import InferConfig
-from pipeline.infer.ways import Association, Sources, build_way_windows
 from pipeline.manifest import StageResult, check_chain, read_manifest, run_stage, write_atomic
 from pipeline.missions import is_mission_directory
+from pipeline.obstacle_file import OBSTACLES_NAME, read_obstacles
 from pipeline.progress import Progress
 from pipeline.results import MissionHypotheses, read_hypothesis_tables
 from pipeline.tables import read_table
@@ -239,11 +238,12 @@ class _Case:
 def _case(directory: Path, stored: MissionHypotheses, config: EvaluateConfig) -> _Case:
     detections, _ = read_table(directory / "detections.parquet", "detections")
     truth, _ = read_table(directory / "truth.parquet", "truth")
-    grid, infer = _stored_grid(stored, directory), _infer_config(directory)
+    told = _Told.of(directory)
+    grid = _stored_grid(stored, directory, told.context_steps)
     path = directory / LABELS_NAME
     is_matched = path.is_file()
     labels = read_table(path, "labels")[0] if is_matched else None
-    windows, fitting = _seen(detections, grid, infer, config.seed, labels)
+    windows, fitting = _seen(detections, grid, told.default_sigma_m, config.seed, labels)
     if not is_matched:
         truth = _named_like(truth, windows.agent_ids, directory)
     names = tuple(sorted(pc.unique(truth["agent_id"]).to_pylist())) if is_matched else windows.agent_ids
@@ -258,10 +258,9 @@ def _case(directory: Path, stored: MissionHypotheses, config: EvaluateConfig) ->
 
 
 def _seen(
-    detections: pa.Table, grid: Grid, infer: InferConfig, seed: int, labels: pa.Table | None
+    detections: pa.Table, grid: Grid, sigma_m: float, seed: int, labels: pa.Table | None
 ) -> tuple[MissionWindows, FittingData]:
     """Windows as they were inferred from, detections of unknown origin under the likeliest way, and what to fit rivals to."""
-    sigma_m = infer.default_sigma_m
     if labels is None:
         windows = build_windows(detections, grid, seed, sigma_m)
         return windows, FittingData.of(detections, grid, windows, sigma_m)
@@ -299,14 +298,14 @@ def default_truth_gap_s(truth: pa.Table, step_s: float) -> float:
     return max(_TRUTH_GAP_STEPS * step_s, 2.0 * median_s)
 
 
-def _stored_grid(stored: MissionHypotheses, directory: Path) -> Grid:
+def _stored_grid(stored: MissionHypotheses, directory: Path, context_steps: int | None) -> Grid:
     drawn = [window for window in stored.windows if len(window.hypothesis)]
     if not drawn:
         raise InputError(f"{directory}: there are no hypotheses to score; see windows.parquet (status, advice) for the reasons")
     origins_ns = np.array([window.origin_ns for window in stored.windows], dtype=np.int64)
     first = drawn[0]
     return Grid(
-        first.step_ns, first.origin_index + 1, first.num_steps - first.origin_index - 1, origins_ns, _context_steps(directory)
+        first.step_ns, first.origin_index + 1, first.num_steps - first.origin_index - 1, origins_ns, context_steps
     )  # fmt: skip
 
 
@@ -326,17 +325,24 @@ def _collision_test(directory: Path, windows: MissionWindows) -> IsInside | None
     return collides
 
 
-def _context_steps(directory: Path) -> int | None:
-    """How far back infer read detections, which is for its checkpoint to say: rivals get the same."""
-    told = (read_manifest("infer", directory) or {}).get("summary", {})
-    steps: int | None = told.get("context_steps", _infer_config(directory).grid.context_steps)
-    return steps
+@dataclass(frozen=True)
+class _Told:
+    """What infer was told of the detections: rivals get the same.
 
+    default_sigma_m  accuracy of detections that state none
+    context_steps    how far back they are read, which is for infer's checkpoint to say
+    """
 
-def _infer_config(directory: Path) -> InferConfig:
-    """The configuration that infer ran with: rivals are given the same; the defaults where it cannot be told."""
-    config = (read_manifest("infer", directory) or {}).get("config")
-    return read_config(InferConfig, config, "infer") if isinstance(config, dict) else InferConfig()
+    default_sigma_m: float = 0.0
+    context_steps: int | None = None
+
+    @staticmethod
+    def of(directory: Path) -> "_Told":
+        """By infer's manifest; the defaults where there is none."""
+        manifest = read_manifest("infer", directory) or {}
+        config, summary = manifest.get("config") or {}, manifest.get("summary") or {}
+        steps = summary.get("context_steps", (config.get("grid") or {}).get("context_steps"))
+        return _Told(float(config.get("default_sigma_m") or 0.0), steps)
 
 
 def _named_like(truth: pa.Table, agent_ids: tuple[str, ...], directory: Path) -> pa.Table:

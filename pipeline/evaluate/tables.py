@@ -1,11 +1,9 @@
 """Scored missions as tables: pooled rows with intervals, ratios between estimators, and their JSON, CSV and Markdown."""
 
-import csv
 import dataclasses
-import io
 import json
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -14,6 +12,7 @@ import numpy as np
 from pipeline.arrays import Int64s
 from pipeline.evaluate.joint import JOINT_METRICS, JointCells, block_of, summarise_joint
 from pipeline.evaluate.scores import PARTS, Cells, ScoreRow, energy_ratio, groups_of, summarise
+from pipeline.plain_rows import rows_as_csv, without_nan
 
 OWN_NAME = "cadence"
 """The estimator whose hypotheses a mission directory holds, in every table."""
@@ -154,16 +153,6 @@ def as_csv(report: ScoreReport) -> str:
     return rows_as_csv(ScoreRow, report.rows)
 
 
-def rows_as_csv(kind: type[Any], rows: Iterable[Any]) -> str:
-    """Instances of the dataclass `kind`, a line each under the names of its fields; None is an empty cell."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow([field.name for field in dataclasses.fields(kind)])
-    for row in rows:
-        writer.writerow(["" if value is None else value for value in dataclasses.astuple(row)])
-    return text.getvalue()
-
-
 def as_markdown(report: ScoreReport) -> str:
     """scores.md: what a person reads first."""
     lines = ["# Scores", "", *_preface(report)]
@@ -184,15 +173,6 @@ def headline(report: ScoreReport) -> list[dict[str, Any]]:
         for row in report.rows
         if row.by == "part" and row.part in ("past", "future") and row.metric in metrics
     ]
-
-
-def without_nan(value: Any) -> Any:
-    """The same JSON-able value with null for what is not a finite number."""
-    if isinstance(value, dict):
-        return {key: without_nan(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [without_nan(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _groups(missions: Sequence[ScoredMission]) -> tuple[Int64s, str]:

@@ -8,8 +8,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from pipeline.catalogue import CatalogueChannel
 from pipeline.export.display import Style
-from pipeline.ingest.stage import CatalogueChannel
 from pipeline.tables import Frame
 from schemas import channels
 

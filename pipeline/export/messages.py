@@ -9,6 +9,7 @@ import numpy as np
 
 from cadence.errors import InputError
 from pipeline.export import numbers
+from pipeline.export.occupancy import Occupancy, future_occupancy
 from pipeline.export.playback import LiveAgent, Tick
 from pipeline.logs.reader import open_log
 from pipeline.logs.wire import field
@@ -131,7 +132,7 @@ def _add_state(state: Any, live: LiveAgent, now_ns: int) -> None:
     state.x_m, state.y_m = (live.weight @ now_m).tolist()
     state.spread_m = numbers.spread_m(now_m, live.weight)
     state.horizon_spread_m = numbers.spread_m(live.position_m[:, -1], live.weight)
-    state.speed_mps = numbers.speed_mps(live, now_ns)
+    state.speed_mps = live.speed_mps(now_ns)
     state.entropy = numbers.weight_entropy(live.weight)
     state.num_modes = live.num_modes
     for name in ("probability", "association_entropy_bits"):
@@ -160,8 +161,8 @@ def encode_occupancy(tick: Tick, frame: Frame, time_ns: int, max_cells: int, z_m
 
     A cell holds the probability (float32) and a colour for viewers that show colours by default (clear where never visited).
     """
-    found = numbers.future_occupancy(tick.scene.live if tick.scene else (), max_cells)
-    found = found or numbers.Occupancy(0.0, 0.0, 1.0, np.zeros((1, 1)))
+    found = future_occupancy(tick.scene.live if tick.scene else (), max_cells)
+    found = found or Occupancy(0.0, 0.0, 1.0, np.zeros((1, 1)))
     probability = found.probability
     cells = np.zeros(probability.shape, dtype=[("probability", "<f4"), ("rgb", "u1", (3,)), ("alpha", "u1")])
     cells["probability"] = probability

@@ -36,6 +36,16 @@ class LiveAgent:
         """Separate groups of hypotheses at the end of the future."""
         return numbers.count_modes(self.position_m[:, -1], self.weight)
 
+    def speed_mps(self, time_ns: int) -> float:
+        """Weighted mean of the hypotheses' speeds in the step around a time; 0 without a second step."""
+        window = self.window
+        if window.num_steps < 2:
+            return 0.0
+        step = window.origin_index + (time_ns - window.origin_ns) // window.step_ns
+        low = int(np.clip(step, 0, window.num_steps - 2))
+        moved = np.linalg.norm(self.position_m[:, low + 1] - self.position_m[:, low], axis=-1)
+        return float(self.weight @ moved) / (window.step_ns * 1e-9)
+
     def at(self, time_ns: int) -> Float64s:
         """Positions [K, 2] at a time: linear between steps, the first or last step outside of them."""
         steps = self.window.origin_index + (time_ns - self.window.origin_ns) / self.window.step_ns

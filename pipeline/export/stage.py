@@ -12,17 +12,19 @@ import pyarrow as pa
 
 from cadence.errors import InputError
 from pipeline.arrays import Float64s
+from pipeline.catalogue import Catalogue, read_catalogue
 from pipeline.config import config_as_dict
 from pipeline.export import maps, messages
 from pipeline.export.display import Drawing, Marks, Style, draw, obstacle_entities, scene_entities
 from pipeline.export.layouts import build_layout, build_legacy_layout
 from pipeline.export.playback import Scene, Tick, build_scenes, plan_ticks
 from pipeline.export.scene import encode_scene
-from pipeline.ingest.stage import CATALOGUE_NAME, Catalogue, read_catalogue
 from pipeline.logs.append import write_combined
 from pipeline.logs.recorder import Compression, Packing
 from pipeline.logs.writer import LogWriter
 from pipeline.manifest import StageResult, hash_file, manifest_path, read_manifest, run_stage
+from pipeline.missions import CATALOGUE_NAME
+from pipeline.obstacle_file import OBSTACLES_NAME, read_obstacle_entries
 from pipeline.progress import Progress
 from pipeline.provenance import versions
 from pipeline.results import MissionHypotheses, read_hypothesis_tables
@@ -104,7 +106,7 @@ def export(directory: Path, config: ExportConfig, progress: Progress, force: boo
     catalogue = read_catalogue(directory)
     if config.combined:
         _check_combinable(catalogue)
-    inputs = [directory / name for name in (CATALOGUE_NAME, *_TABLES, "obstacles.json")]
+    inputs = [directory / name for name in (CATALOGUE_NAME, *_TABLES, OBSTACLES_NAME)]
     inputs += [manifest_path(stage, directory) for stage in _EARLIER_STAGES if manifest_path(stage, directory).is_file()]
     inputs += [path for path in [directory / "associations.parquet"] if path.is_file()]
     inputs += [catalogue.path] if config.combined else []
@@ -156,7 +158,7 @@ def _read_mission(directory: Path, catalogue: Catalogue, config: ExportConfig) -
     hypotheses = read_hypothesis_tables(directory)
     table, _ = read_table(directory / "detections.parquet", "detections")
     table = table.append_column("row", pa.array(np.arange(table.num_rows))).sort_by([("time_ns", "ascending")])
-    obstacles = _read_obstacles(directory / "obstacles.json")
+    obstacles = read_obstacle_entries(directory / OBSTACLES_NAME)
     scenes = build_scenes(hypotheses)
     offset_ns = _clock_offset_ns(table)
     tick_ns = _tick_ns(scenes, config)
@@ -175,18 +177,6 @@ def _read_mission(directory: Path, catalogue: Catalogue, config: ExportConfig) -
         tick_s=tick_ns * 1e-9,
         clock_offset_ns=offset_ns,
     )
-
-
-def _read_obstacles(path: Path) -> list[dict[str, Any]]:
-    try:
-        obstacles = json.loads(path.read_text(encoding="utf-8"))["obstacles"]
-        if not isinstance(obstacles, list):
-            raise TypeError("obstacles is not a list")
-        if any(obstacle["kind"] not in ("circle", "polygon") for obstacle in obstacles):
-            raise ValueError("an obstacle is neither a circle nor a polygon")
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{path}: cannot be read ({error}); run extract again with --force") from error
-    return obstacles
 
 
 def _read_sources(path: Path) -> dict[int, list[dict[str, Any]]]:

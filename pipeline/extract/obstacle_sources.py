@@ -12,10 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
-from cadence.constraints.obstacles import Obstacles
-from cadence.errors import ConfigError, InputError
+from cadence.errors import ConfigError
 from pipeline.config import load_toml, read_config
 from pipeline.extract.grids import (
     FOXGLOVE_GRIDS,
@@ -29,12 +27,9 @@ from pipeline.extract.grids import (
 from pipeline.frames import to_geodetic, to_local
 from pipeline.logs.decode import UndecodableChannel, UndecodableMessage, decoder_for
 from pipeline.logs.reader import MissionLog
+from pipeline.obstacle_file import Json, checked_entry, listed_entries
 from pipeline.tables import Frame
 
-VERSION = 1
-OBSTACLES_NAME = "obstacles.json"
-
-Json = dict[str, Any]
 Points = tuple[tuple[float, float], ...]
 Note = Callable[[str], object]
 
@@ -128,56 +123,6 @@ def collect_obstacles(log: MissionLog, sources: ObstacleSources, frame: Frame, n
     return found
 
 
-def write_obstacles(path: Path, obstacles: Sequence[Mapping[str, Any]]) -> None:
-    """Write obstacles.json."""
-    path.write_text(json.dumps({"version": VERSION, "obstacles": list(obstacles)}, indent=1) + "\n", encoding="utf-8")
-
-
-def read_obstacles(path: Path) -> Obstacles:
-    """The obstacles of a mission; `InputError` where the file is absent or not ours."""
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-        entries = [_checked(entry) for entry in _entries(content)]
-    except OSError as error:
-        raise InputError(
-            f"{path}: cannot be read ({error.strerror}); run extract first (cadence run does all stages)"
-        ) from error
-    except (ValueError, TypeError, LookupError) as error:
-        raise InputError(f"{path}: not a list of obstacles ({error}); run extract again with --force") from error
-    return as_obstacles(entries)
-
-
-def as_obstacles(entries: Sequence[Mapping[str, Any]]) -> Obstacles:
-    """Entries of obstacles.json as the estimators see them. ValueError where one has no meaning."""
-    circles = [[entry["x_m"], entry["y_m"], entry["radius_m"]] for entry in entries if entry["kind"] == "circle"]
-    polygons = [entry["rings_m"] for entry in entries if entry["kind"] == "polygon"]
-    rings = tuple(tuple(torch.tensor(ring, dtype=torch.float64).reshape(-1, 2) for ring in polygon) for polygon in polygons)
-    return Obstacles(torch.tensor(circles, dtype=torch.float64).reshape(-1, 3), rings)
-
-
-def _entries(content: Any) -> list[Any]:
-    if not isinstance(content, dict) or not isinstance(content.get("obstacles"), list):
-        raise ValueError("no list `obstacles`")
-    if content.get("version") != VERSION:
-        raise ValueError(f"version {content.get('version')!r}, expected {VERSION}")
-    entries: list[Any] = content["obstacles"]
-    return entries
-
-
-def _checked(entry: Any) -> Json:
-    """The entry with plain floats; ValueError, TypeError or LookupError where it has no meaning."""
-    kind = entry["kind"]
-    name = {"name": str(entry["name"])} if entry.get("name") else {}
-    if kind == "circle":
-        clean: Json = {"kind": kind, **{key: float(entry[key]) for key in ("x_m", "y_m", "radius_m")}, **name}
-    elif kind == "polygon":
-        clean = {"kind": kind, "rings_m": [[[float(x), float(y)] for x, y in ring] for ring in entry["rings_m"]], **name}
-    else:
-        raise ValueError(f"kind {kind!r}, expected circle or polygon")
-    as_obstacles([clean])
-    return clean
-
-
 def _from_tables(
     circles: Sequence[CircleSource], polygons: Sequence[PolygonSource], frame: Frame, where: str
 ) -> Iterator[Json]:
@@ -211,7 +156,7 @@ def _from_file(path: Path, frame: Frame) -> list[Json]:
     if isinstance(content, dict) and "type" in content:
         return list(_from_geojson(content, frame, str(path)))
     try:
-        entries = _entries(content)
+        entries = listed_entries(content)
     except ValueError as error:
         raise ConfigError(f"{path}: neither GeoJSON nor obstacles.json ({error}); correct the file") from error
     return [_valid(entry, f"{path}: obstacles[{index}]") for index, entry in enumerate(entries)]
@@ -259,7 +204,9 @@ def _from_metadata(log: MissionLog, frame: Frame, note: Note) -> list[Json]:
             elif name == "mission" and "mountains" in record:
                 _check_local(frame, where)
                 mountains = json.loads(record["mountains"])
-                found += [_checked({"kind": "circle", **item, "radius_m": item["keep_out_radius_m"]}) for item in mountains]
+                found += [
+                    checked_entry({"kind": "circle", **item, "radius_m": item["keep_out_radius_m"]}) for item in mountains
+                ]
         except (ConfigError, ValueError, TypeError, LookupError, AttributeError) as error:
             note(f"{where}: obstacles left out ({error})")
     return _once(found)
@@ -277,7 +224,7 @@ def _from_record(record: Mapping[str, str], frame: Frame, where: str) -> list[Js
     if "geojson" in record:
         found += _from_geojson(json.loads(record["geojson"]), frame, where)
     content = json.loads(record.get("obstacles", "[]"))
-    entries = [_checked(entry) for entry in (content if isinstance(content, list) else _entries(content))]
+    entries = [checked_entry(entry) for entry in (content if isinstance(content, list) else listed_entries(content))]
     if "latitude_deg" in record and "longitude_deg" in record:
         if frame.is_georeferenced:
             datum = Frame("record", float(json.loads(record["latitude_deg"])), float(json.loads(record["longitude_deg"])))
@@ -340,7 +287,7 @@ def _from_grid(log: MissionLog, topic: str, sources: ObstacleSources, frame: Fra
         )
         return []
     name = {"name": topic}
-    return [_checked({"kind": "polygon", "rings_m": rings, **name}) for rings in occupied_polygons(grid)]
+    return [checked_entry({"kind": "polygon", "rings_m": rings, **name}) for rings in occupied_polygons(grid)]
 
 
 def _check_local(frame: Frame, where: str) -> None:
@@ -367,7 +314,7 @@ def _local(points: Any, frame: Frame, where: str) -> list[list[float]]:
 
 def _valid(entry: Any, where: str) -> Json:
     try:
-        return _checked(entry)
+        return checked_entry(entry)
     except (ValueError, TypeError, LookupError, AttributeError) as error:
         raise ConfigError(f"{where}: {_reason(error)}; correct the geometry") from error
 

@@ -16,9 +16,10 @@ import pyarrow as pa
 
 from cadence.errors import ConfigError, ImplausibleInputError, InputError, NothingDetectedError
 from pipeline.arrays import Objects
+from pipeline.catalogue import open_catalogued_log, read_catalogue
 from pipeline.extract.collapse import Collapsed, collapse
 from pipeline.extract.identity import without_false_names
-from pipeline.extract.obstacle_sources import OBSTACLES_NAME, ObstacleSources, collect_obstacles, write_obstacles
+from pipeline.extract.obstacle_sources import ObstacleSources, collect_obstacles
 from pipeline.extract.placement import Placing, bring_together, in_enu, mission_frame, place
 from pipeline.extract.plausibility import Kind, Suspicions
 from pipeline.extract.positions import ChannelReader, Positions, Rows
@@ -30,10 +31,11 @@ from pipeline.extract.summary import summarise, tell
 from pipeline.extract.thinning import ThinningConfig, is_seen, noise
 from pipeline.extract.transform_messages import LogTransforms
 from pipeline.extract.transforms import Limits
-from pipeline.ingest.stage import CATALOGUE_NAME, open_catalogued_log, read_catalogue
 from pipeline.logs.reader import MissionLog
 from pipeline.manifest import StageResult, run_stage
 from pipeline.mapping.sources import SourceConfig
+from pipeline.missions import CATALOGUE_NAME
+from pipeline.obstacle_file import OBSTACLES_NAME, write_obstacles
 from pipeline.progress import Progress
 from pipeline.tables import Frame, write_table
 from schemas.tables import DETECTIONS, POSES, TRUTH

@@ -25,14 +25,15 @@ from cadence.diffusion.absolute import AbsoluteSampling
 from cadence.diffusion.scene import SceneSampling
 from cadence.errors import ConfigError, InputError
 from cadence.recordings import ForecastWindows, Recordings, choose_windows, cut_windows
-from cadence.types import Context, Detections, Estimator, HypothesisSet, WindowBatch
+from cadence.types import Detections, Estimator, HypothesisSet, WindowBatch
 from pipeline.checkpoints import checkpoint_hash, find_checkpoint
 from pipeline.config import config_as_dict
 from pipeline.episodes.recordings import RecordingsConfig, RecordingSet, load_recordings
-from pipeline.forecast.forecasters import FORECAST_RIVALS, Samplings, label_of, load_forecaster
+from pipeline.estimators.presets import load_forecaster
+from pipeline.estimators.samplings import Samplings
+from pipeline.forecast.rivals import FORECAST_RIVALS, label_of
 from pipeline.forecast.scores import HORIZONS, EpisodeScores, score_forecasts
 from pipeline.forecast.tables import ForecastFacts, as_csv, as_json, as_markdown, headline, pool
-from pipeline.infer.placed_draws import Forecaster
 from pipeline.manifest import StageResult, hash_file, run_stage, write_atomic
 from pipeline.progress import Progress
 from pipeline.provenance import versions
@@ -55,7 +56,7 @@ class ForecastConfig:
     known_goal      a goal that the searching side knows of is told to estimators that read it
     trackers        so are the positions of the trackers
     obstacles       and what is in the way, to estimators that keep out of it
-    rivals          out of `pipeline.forecast.forecasters.FORECAST_RIVALS`, scored on the same windows
+    rivals          out of `pipeline.forecast.rivals.FORECAST_RIVALS`, scored on the same windows
     checkpoints     further ones, scored beside: files or shipped names
     num_resamples   bootstrap resamples of an interval, over episodes
     seed            of the choice of windows, of the hypotheses and of the bootstrap
@@ -106,9 +107,9 @@ def evaluate_forecasts(
     Raises `InputError` where no log can be used, `ConfigError` for a checkpoint that is not there or does not forecast.
     """
     names = tuple(dict.fromkeys([checkpoint, *config.checkpoints]))
-    samplings = Samplings(config.paper, config.scene)
-    forecasters = {label_of(name): load_forecaster(name, samplings) for name in names}
-    if len(forecasters) < len(names):
+    samplings = Samplings(paper=config.paper, scene=config.scene)
+    estimators = {label_of(name): load_forecaster(name, samplings) for name in names}
+    if len(estimators) < len(names):
         raise ConfigError(f"evaluate.forecast.checkpoints: two of {', '.join(names)} have the same name; rename one")
     source = dataclasses.replace(config.recordings, data=folder)
     logs = sorted(folder.glob(source.pattern)) if folder.is_dir() else []
@@ -118,7 +119,7 @@ def evaluate_forecasts(
     def body(work: Path) -> Mapping[str, Any]:
         # Beside the results, not inside the working folder: what a killed call has done is to be found again.
         cache = out / "cache"
-        together = any(draws_together(forecaster) for forecaster in forecasters.values())
+        together = any(map(draws_together, estimators.values()))
         episodes = load_recordings(source, cache, progress, together)
         windows = forecast_windows(episodes.recordings, config)
         run = ForecastRun(episodes, windows, config.num_hypotheses, cache / "scores", progress, config.obstacles)
@@ -128,9 +129,10 @@ def evaluate_forecasts(
             assert config.training is not None  # refused by the configuration
             return load_recordings(config.training, cache, progress).recordings.apart()
 
+        settings = [config.paper, config.scene]
         scores = {
-            label: run.score(label, functools.partial(_same, forecasters[label]), [checkpoint_hash(path), samplings])
-            for label, path in zip(forecasters, weights, strict=True)
+            label: run.score(label, functools.partial(_same, estimators[label]), [checkpoint_hash(path), *settings])
+            for label, path in zip(estimators, weights, strict=True)
         }
         for name in config.rivals:
             scores[name] = run.score(name, functools.partial(_fitted, name, training), [name, config.training])
@@ -152,11 +154,11 @@ def evaluate_forecasts(
     return run_stage(STAGE, out, config=key, inputs=inputs, body=body, force=force)
 
 
-def _same(forecaster: Forecaster) -> Forecaster:
-    return forecaster
+def _same(estimator: Estimator) -> Estimator:
+    return estimator
 
 
-def _fitted(name: str, training: Callable[[], Recordings]) -> Forecaster:
+def _fitted(name: str, training: Callable[[], Recordings]) -> Estimator:
     return FORECAST_RIVALS[name](training())
 
 
@@ -173,7 +175,7 @@ def forecast_windows(recordings: Recordings, config: ForecastConfig) -> Forecast
         context = dataclasses.replace(context, known_goal_m=nothing)
     if not config.trackers and context.tracker_m is not None:
         context = dataclasses.replace(context, tracker_m=torch.full_like(context.tracker_m, torch.nan))
-    return dataclasses.replace(windows, context=context)
+    return windows.with_context(context)
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,7 +183,7 @@ class ForecastRun:
     """Windows of some episodes, and where the scores of their blocks are kept.
 
     cache  a folder; None: nothing is kept
-    tells_obstacles  to forecasters that keep out of them
+    tells_obstacles  to estimators that keep out of them
     """
 
     episodes: RecordingSet
@@ -207,8 +209,8 @@ class ForecastRun:
         found.update(repr([texts[id(item)] for item in self.episodes.obstacles]).encode())
         return found.hexdigest()
 
-    def score(self, label: str, build: Callable[[], Forecaster], identity: list[object]) -> EpisodeScores:
-        """Scores of a forecaster, which is built only where a block is not kept already.
+    def score(self, label: str, build: Callable[[], Estimator], identity: list[object]) -> EpisodeScores:
+        """Scores of an estimator, which is built only where a block is not kept already.
 
         `identity` is what its answers depend on: names, hashes, configurations.
         """
@@ -216,7 +218,7 @@ class ForecastRun:
         asked = [self.num_hypotheses, self.tells_obstacles]
         key = json.dumps([plain, self.content, asked, versions(), SCORES_FORMAT], sort_keys=True, default=str)
         stem = f"{label}-{hashlib.sha256(key.encode()).hexdigest()[:24]}"
-        forecaster: Forecaster | None = None
+        estimator: Estimator | None = None
         parts = []
         with self.progress.bar(len(self.windows), label, unit="window") as bar:
             for begin in range(0, len(self.windows), BLOCK):
@@ -224,36 +226,37 @@ class ForecastRun:
                 path = None if self.cache is None else self.cache / f"{stem}-{begin:06d}.json"
                 found = _kept(path)
                 if found is None:
-                    forecaster = forecaster or build()
-                    found = self._score_block(forecaster, part)
+                    estimator = estimator or build()
+                    found = self._score_block(estimator, part)
                     if path is not None:
                         write_atomic(path, found.as_json())
                 parts.append(found)
                 bar.update(len(part))
         return EpisodeScores.add(parts)
 
-    def _score_block(self, forecaster: Forecaster, part: ForecastWindows) -> EpisodeScores:
+    def _score_block(self, estimator: Estimator, part: ForecastWindows) -> EpisodeScores:
         """The windows of episodes with the same obstacles go together."""
         which = [id(self._obstacles(index)) for index in part.episode.tolist()]
         groups = [part[torch.tensor([item == chosen for item in which])] for chosen in dict.fromkeys(which)]
-        return EpisodeScores.add([self._score_group(forecaster, group) for group in groups])
+        return EpisodeScores.add([self._score_group(estimator, group) for group in groups])
 
-    def _score_group(self, forecaster: Forecaster, part: ForecastWindows) -> EpisodeScores:
+    def _score_group(self, estimator: Estimator, part: ForecastWindows) -> EpisodeScores:
         obstacles = self._obstacles(int(part.episode[0]))
         alone = part.apart()
         is_known = alone.windows.is_active[:, 0]
         alone = alone[is_known]
         begin = time.process_time()
-        asked = part if draws_together(forecaster) else alone
-        estimator = forecaster.placed(asked.context, obstacles if self.tells_obstacles else None)
+        asked = part if draws_together(estimator) else alone
+        if self.tells_obstacles:
+            asked = asked.with_context(dataclasses.replace(asked.context, obstacles=obstacles))
         found = estimator.sample(asked.windows, self.num_hypotheses)
         seconds = time.process_time() - begin
-        if asked is part:
+        if draws_together(estimator):
             found = _agent_by_agent(found, is_known)
         num_lost = int((~torch.isfinite(found.position_m)).flatten(1).any(dim=1).sum())
         if num_lost:
             raise ConfigError(
-                f"{forecaster.name}: no position for {num_lost} of {len(alone)} windows; does it need a known goal "
+                f"{estimator.name}: no position for {num_lost} of {len(alone)} windows; does it need a known goal "
                 "or trackers that the logs do not have? See evaluate.forecast"
             )
         paper = paper_error(estimator, asked.windows, asked.truth_m)
@@ -263,9 +266,9 @@ class ForecastRun:
         return self.episodes.obstacles[episode * self.episodes.recordings.num_agents]
 
 
-def draws_together(forecaster: Forecaster) -> bool:
-    """Whether a forecaster draws all agents of a window together, so that it must see them in one."""
-    return bool(getattr(forecaster, "draws_together", False))
+def draws_together(estimator: Estimator) -> bool:
+    """Whether an estimator draws all agents of a window together, so that it must see them in one."""
+    return bool(getattr(estimator, "draws_together", False))
 
 
 def _agent_by_agent(found: HypothesisSet, is_known: Tensor) -> HypothesisSet:
@@ -307,9 +310,6 @@ class _Truth:
     windows: ForecastWindows
     name: str = "truth"
     draws_together: bool = True
-
-    def placed(self, context: Context, obstacles: Obstacles | None = None) -> Estimator:
-        return self
 
     def fit(self, tracks: Detections) -> "_Truth":
         return self

@@ -11,8 +11,8 @@ import numpy as np
 
 from cadence.metrics import Interval, bootstrap_ratio
 from pipeline.arrays import Float64s
-from pipeline.evaluate.tables import rows_as_csv, without_nan
 from pipeline.forecast.scores import HORIZONS, MEASURES, EpisodeScores, step_quantiles
+from pipeline.plain_rows import rows_as_csv, without_nan
 
 FORECAST_VERSION = 1
 STEP_LEVELS = (0.05, 0.25, 0.5, 0.75, 0.95, 0.99)

@@ -1,28 +1,51 @@
-"""Hypotheses of windows whose detections can be read in several ways: each is drawn under its own way."""
+"""Windows in chunks to hypotheses, also where their detections can be read in several ways: each is drawn under its own way."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from cadence.types import HypothesisSet, WindowBatch
-from pipeline.arrays import Int64s
-from pipeline.infer.ways import WayWindows
+from cadence.types import Estimator
+from pipeline.associations import WayWindows
 from pipeline.windows import MissionWindows
 
 _WINDOWS_AT_ONCE = 32
+_TRACKS_AT_ONCE = 48
 _WORST_FIRST = ("guidance_diverged", "infeasible", "ok")
 
 Drawn = tuple[Tensor, Tensor, Tensor, list[list[str]]]
 """Numbers of windows [b], positions [b, K, A, T, 2] about their datum, weights [b, K], status [b][A]."""
 
 
-def draw_tracks(ways: WayWindows, draw: Callable[[MissionWindows], Iterator[Drawn]]) -> Iterator[Drawn]:
+def draw_windows(estimator: Estimator, windows: MissionWindows, num_hypotheses: int, is_apart: bool) -> Iterator[Drawn]:
+    """Windows whose detections say whose they are; `is_apart`: agent by agent, so that chunks are counted in agents."""
+    batch = windows.batch
+    for part in _by_tracks(windows) if is_apart else _by_windows(batch.num_windows):
+        drawn = estimator.sample(batch[part], num_hypotheses)
+        yield part, drawn.position_m.double(), drawn.weight.double(), [list(row) for row in drawn.status]
+
+
+def _by_windows(num_windows: int) -> Iterator[Tensor]:
+    for begin in range(0, num_windows, _WINDOWS_AT_ONCE):
+        yield torch.arange(begin, min(begin + _WINDOWS_AT_ONCE, num_windows))
+
+
+def _by_tracks(windows: MissionWindows) -> Iterator[Tensor]:
+    per_window = windows.batch.is_active.sum(1).clamp_min(1)
+    chunk_of = (per_window.cumsum(0) - 1) // _TRACKS_AT_ONCE
+    for chunk in range(int(chunk_of[-1]) + 1):
+        part = torch.nonzero(chunk_of == chunk)[:, 0]
+        if len(part):
+            yield part
+
+
+def draw_tracks(estimator: Estimator, ways: WayWindows, num_hypotheses: int) -> Iterator[Drawn]:
     """For estimators that treat agents apart: every different track of a window is drawn once, and joined by the ways."""
-    for begin in range(0, ways.windows.batch.num_windows, _WINDOWS_AT_ONCE):
-        windows, column = ways.tracks(slice(begin, begin + _WINDOWS_AT_ONCE))
-        for part, position, weight, status in draw(windows):
+    for whole in _by_windows(ways.windows.batch.num_windows):
+        begin = int(whole[0])
+        windows, column = ways.tracks(slice(begin, begin + len(whole)))
+        for part, position, weight, status in draw_windows(estimator, windows, num_hypotheses, is_apart=True):
             yield begin + part, *_joined(column[part], position, weight, status)
 
 
@@ -43,20 +66,12 @@ def _worst(status: list[str]) -> str:
     return next((word for word in _WORST_FIRST if word in status), "no_detections")
 
 
-def draw_ways(
-    ways: WayWindows, num_hypotheses: int, sample: Callable[[WindowBatch, Int64s, int], HypothesisSet]
-) -> Iterator[Drawn]:
-    """For estimators whose agents see each other: every way is a window, drawn as often as it has hypotheses.
-
-    Args:
-        ways: the windows.
-        num_hypotheses: of a window, over all of its ways.
-        sample: draws a batch out of windows with the given numbers.
-    """
+def draw_ways(estimator: Estimator, ways: WayWindows, num_hypotheses: int) -> Iterator[Drawn]:
+    """For estimators whose agents see each other: every way is a window, drawn as often as it has hypotheses."""
     whole = ways.windows
     num_agents, num_steps = len(whole.agent_ids), whole.batch.num_steps
-    for begin in range(0, whole.batch.num_windows, _WINDOWS_AT_ONCE):
-        part = torch.arange(begin, min(begin + _WINDOWS_AT_ONCE, whole.batch.num_windows))
+    for part in _by_windows(whole.batch.num_windows):
+        begin = int(part[0])
         some, window, count = ways.ways(slice(begin, begin + len(part)))
         # hypotheses of a window by way: where those of each way begin
         first = np.cumsum(count) - count - num_hypotheses * (window - begin)
@@ -65,7 +80,7 @@ def draw_ways(
         found: list[list[set[str]]] = [[set() for _ in range(num_agents)] for _ in part]
         for size in np.unique(count).tolist():
             chosen = np.flatnonzero(count == size)
-            drawn = sample(some.batch[torch.from_numpy(chosen)], window[chosen], size)
+            drawn = estimator.sample(some.batch[torch.from_numpy(chosen)], size)
             rows = torch.from_numpy(window[chosen] - begin)[:, None]
             columns = torch.from_numpy(first[chosen])[:, None] + torch.arange(size)
             position[rows, columns] = drawn.position_m.double()

@@ -5,7 +5,7 @@ import pyarrow as pa
 import torch
 from torch import Tensor
 
-from pipeline.infer.ways import WayWindows
+from pipeline.associations import WayWindows
 from pipeline.windows import Grid, MissionWindows
 from schemas.tables import WINDOWS, hypotheses_schema
 

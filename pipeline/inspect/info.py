@@ -4,7 +4,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from pipeline.ingest.stage import CatalogueChannel, survey_channels
+from pipeline.catalogue import CatalogueChannel
+from pipeline.ingest.stage import survey_channels
 from pipeline.logs.parts import recorded_parts
 from pipeline.logs.reader import Health, open_log, open_parts, utc
 from pipeline.mapping.guess import suggest_mapping

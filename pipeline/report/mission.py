@@ -17,6 +17,7 @@ import pyarrow as pa
 from cadence.errors import InputError
 from pipeline.arrays import Float32s, Float64s, Int64s
 from pipeline.manifest import hash_file, read_manifest
+from pipeline.obstacle_file import OBSTACLES_NAME, read_obstacle_entries
 from pipeline.report.origins import Origins, origins_of, with_likeliest
 from pipeline.results import AgentHypotheses, MissionHypotheses, WindowHypotheses, read_hypothesis_tables
 from pipeline.tables import Frame, read_table
@@ -152,7 +153,7 @@ class Mission:
 
 def mission_inputs(directory: Path) -> list[Path]:
     """The files of `directory` that the page depends on, as far as they exist."""
-    names = ["catalogue.json", "detections.parquet", "hypotheses.parquet", "windows.parquet", "obstacles.json"]
+    names = ["catalogue.json", "detections.parquet", "hypotheses.parquet", "windows.parquet", OBSTACLES_NAME]
     names += [
         "associations.parquet",
         "truth.parquet",
@@ -194,7 +195,7 @@ def load_mission(directory: Path) -> Mission:
         poses=_points(poses, "sensor_id", sensors) if poses is not None else None,
         rows=rows,
         fans=_fans(hypotheses, agents),
-        obstacles=_obstacles(directory / "obstacles.json"),
+        obstacles=_obstacles(directory / OBSTACLES_NAME),
         manifests=manifests,
         scores=_read_json(scores) if scores.is_file() else None,
         has_stale_scores=_is_stale(manifests.get("evaluate"), directory / "hypotheses.parquet"),
@@ -296,12 +297,7 @@ def _fan(window: WindowHypotheses, agent: AgentHypotheses, index: int) -> Fan | 
 
 
 def _obstacles(path: Path) -> tuple[Obstacle, ...]:
-    if not path.is_file():
-        return ()
-    try:
-        return tuple(_obstacle(entry) for entry in _read_json(path).get("obstacles", []))
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise InputError(f"{path}: not a list of obstacles ({error}); run extract again with --force") from error
+    return tuple(_obstacle(entry) for entry in read_obstacle_entries(path)) if path.is_file() else ()
 
 
 def _obstacle(entry: JsonDict) -> Obstacle:

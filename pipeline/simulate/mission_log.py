@@ -22,6 +22,7 @@ from mcap.writer import Writer
 from cadence.worlds.episode import Episode
 from cadence.worlds.terrain import Terrain
 from pipeline.frames import to_geodetic
+from pipeline.obstacle_file import obstacles_as_json
 from pipeline.provenance import versions
 from pipeline.simulate.forms import Encoding, Form, Report, detection_form, group_form, pose_form, protobuf_schema
 from pipeline.tables import Frame
@@ -68,13 +69,6 @@ def write_mission(path: Path, episode: Episode, form: MissionForm, mission: Mapp
         writer.add_metadata("cadence.obstacles", _obstacle_metadata(episode.terrain, form.frame))
         _write_messages(writer, episode, form)
         writer.finish()  # type: ignore[no-untyped-call]
-
-
-def obstacles_as_json(terrain: Terrain) -> list[dict[str, Any]]:
-    """Obstacles in the format of obstacles.json: circles and polygons in the mission frame, rounded to a millimetre."""
-    circles = [{"kind": "circle", "x_m": x, "y_m": y, "radius_m": r} for x, y, r in np.round(terrain.circles_m, 3).tolist()]
-    rings = [np.round(polygon, 3).tolist() for polygon in terrain.polygons_m]
-    return [*({"kind": "polygon", "rings_m": [[*ring, ring[0]]]} for ring in rings), *circles]
 
 
 def _obstacle_metadata(terrain: Terrain, frame: Frame) -> dict[str, str]:

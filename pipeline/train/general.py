@@ -2,7 +2,7 @@
 
 import functools
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -13,16 +13,14 @@ from cadence.network.residual import ResidualNetwork
 from cadence.training.loop import Loss, Trainer
 from cadence.training.residual import residual_loss
 from cadence.training.synthetic import ResidualWindows, join_windows, residual_windows
-from pipeline.infer.stage import fitted_bank
+from pipeline.estimators.fitting import FittingData
 from pipeline.manifest import StageResult
 from pipeline.progress import Progress
+from pipeline.train.config import TrainConfig
 from pipeline.train.missions import TrainingMission, missions_of_logs
 from pipeline.train.run import TrainingRun, run_training
 from pipeline.train.shards import synthetic_shard
-from pipeline.windows import GridConfig, build_windows, fit_tracks, plan_grid, truth_on_grid
-
-if TYPE_CHECKING:
-    from pipeline.train.stage import TrainConfig
+from pipeline.windows import GridConfig, build_windows, plan_grid, truth_on_grid
 
 _VALIDATION_SEED_OFFSET = 500_009
 _VALIDATION_SHARE = 0.1
@@ -31,7 +29,7 @@ _STEPS_A_SHARD = 120
 _MAX_GAP_STEPS = 4.0
 
 
-def train_general(out: Path, config: "TrainConfig", progress: Progress, force: bool = False) -> StageResult:
+def train_general(out: Path, config: TrainConfig, progress: Progress, force: bool = False) -> StageResult:
     """Train the general preset into `out`; see `pipeline.train.stage.train`. `config.data` None means synthetic kinematics."""
     source: _Source = _LogSource(out, config, progress) if config.data is not None else _SyntheticSource(out, config)
     with torch.random.fork_rng(devices=[]):  # layers take their first weights from the global stream, which is left as it was
@@ -65,7 +63,7 @@ class _Source(Protocol):
 class _SyntheticSource:
     """Shards of synthetic windows, two of them for each batch; each shard depends on its seed alone."""
 
-    def __init__(self, out: Path, config: "TrainConfig") -> None:
+    def __init__(self, out: Path, config: TrainConfig) -> None:
         self.folder, self.config = out / "windows", config
         self.shards: dict[int, ResidualWindows] = {}
         seed = config.seed + _VALIDATION_SEED_OFFSET
@@ -86,7 +84,7 @@ class _SyntheticSource:
 class _LogSource:
     """Windows of a folder of logs; a tenth of the logs, whole, is for validation."""
 
-    def __init__(self, out: Path, config: "TrainConfig", progress: Progress) -> None:
+    def __init__(self, out: Path, config: TrainConfig, progress: Progress) -> None:
         assert config.data is not None
         missions = missions_of_logs(config.data, out / "logs", config.extract, progress)
         if len(missions) < 2:
@@ -107,7 +105,7 @@ class _LogSource:
         return self.windows[torch.randint(len(self.windows), (size,), generator=generator)]
 
 
-def mission_windows(mission: TrainingMission, config: "TrainConfig", seed: int) -> ResidualWindows | None:
+def mission_windows(mission: TrainingMission, config: TrainConfig, seed: int) -> ResidualWindows | None:
     """Windows of one log with truth at every step, seen through the bank fitted to that log; None without any."""
     grid_config = GridConfig(history_steps=config.windows.history_steps, horizon_steps=config.windows.horizon_steps)
     grid = plan_grid(mission.detections, grid_config)
@@ -116,7 +114,7 @@ def mission_windows(mission: TrainingMission, config: "TrainConfig", seed: int) 
     usable = torch.nonzero((is_known.all(-1) & windows.batch.is_active).any(-1))[:, 0]
     if len(usable) == 0:
         return None
-    bank = fitted_bank(fit_tracks(mission.detections, grid), mission.detections, grid, windows)
+    bank = FittingData.of(mission.detections, grid, windows).fitted_bank()
     batch = windows.batch[usable]
     all_windows = residual_windows(bank, batch, truth_m[usable], config.windows.num_samples)
     return all_windows[is_known[usable].all(-1)[batch.is_active]]

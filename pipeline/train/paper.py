@@ -3,9 +3,9 @@
 import dataclasses
 import functools
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -14,21 +14,19 @@ from torch import Tensor, nn
 from cadence.bank.rows import active_rows
 from cadence.diffusion.absolute import AbsoluteConfig, detection_rows
 from cadence.errors import ConfigError, InputError
-from cadence.network.trajectory import TrajectoryNetwork, TrajectoryNetworkConfig
-from cadence.recordings import NUM_STEPS, Recordings, cut_windows
+from cadence.network.trajectory import TrajectoryNetwork
+from cadence.recordings import Recordings, cut_windows
 from cadence.training.absolute import AbsoluteWindows, absolute_loss, forecast_rows, join_absolute
 from cadence.training.loop import Loss, Trainer
-from cadence.worlds.patrol import PatrolConfig, simulate_patrol
+from cadence.worlds.patrol import simulate_patrol
 from pipeline.arrays import Column, Float64s, Int64s
-from pipeline.episodes.pool import EpisodeSource, load_pool
+from pipeline.episodes.pool import load_pool
 from pipeline.manifest import StageResult
 from pipeline.progress import Progress
+from pipeline.train.config import AbsoluteTraining, TrainConfig
 from pipeline.train.missions import TrainingMission, mission_of_episode, missions_of_logs
 from pipeline.train.run import TrainingRun, run_training
 from pipeline.windows import Grid, MissionWindows, build_windows, truth_on_grid
-
-if TYPE_CHECKING:
-    from pipeline.train.stage import TrainConfig
 
 _VALIDATION_SEED_OFFSET = 500_009
 _STEPS_AN_EPISODE = 10
@@ -38,88 +36,7 @@ _MARGIN = 1.02
 """Map limits taken from the truth get this much room."""
 
 
-def _patrol() -> PatrolConfig:
-    return PatrolConfig(duration_s=21_600.0, step_s=30.0)
-
-
-@dataclass(frozen=True)
-class AbsoluteTraining:
-    """What the paper's preset is trained on.
-
-    network        the paper's by default
-    step_s         seconds between steps
-    history_steps  steps up to and including the origin: 1 in the paper, which predicts only
-    context_steps  detections from this many steps before the origin on are read
-    relative       positions about the last detection instead of the map's centre
-    clip           clean estimates are clamped to it when sampling, in units of half the map
-    centre_m, scale_m  the map's centre and half its side; by default from the truth of the training logs
-    num_windows    random windows of each episode
-    parked_tail    after the end of its truth an agent stays where it was (the paper); otherwise those steps do not count
-    max_gap_steps  truth is interpolated between samples that are no further apart
-    validation_share  of the logs, whole ones; at least one
-    num_episodes, num_validation_episodes  of the simulator
-    patrol         the simulator's settings
-    sources        episodes of one target to train on, in place of logs and patrol: any number of windows, as in the paper
-                   with the first position as a detection and the target parked after the end
-    validation     episodes to validate on; without them the last ones of each source (validation_share)
-    num_validation_windows  of each source
-    hidden_goals   share of the windows of `sources` whose known goal is hidden, for networks with known_goal; more than 0
-                   makes a checkpoint that serves with and without
-    """
-
-    network: TrajectoryNetworkConfig = field(default_factory=TrajectoryNetworkConfig)
-    step_s: float = 60.0
-    history_steps: int = 1
-    context_steps: int = 4320
-    relative: bool = False
-    clip: float = 1.0
-    centre_m: tuple[float, float] | None = None
-    scale_m: float | None = None
-    num_windows: int = 64
-    parked_tail: bool = True
-    max_gap_steps: float = 2.0
-    validation_share: float = 0.1
-    num_episodes: int = 400
-    num_validation_episodes: int = 16
-    patrol: PatrolConfig = field(default_factory=_patrol)
-    sources: tuple[EpisodeSource, ...] = ()
-    validation: tuple[EpisodeSource, ...] = ()
-    num_validation_windows: int = 1000
-    hidden_goals: float = 0.0
-
-    def __post_init__(self) -> None:
-        self.model_config((0.0, 0.0), self.scale_m or 1.0)  # refuses what cannot be
-        if min(self.num_windows, self.num_episodes, self.num_validation_episodes, self.num_validation_windows) < 1:
-            raise ValueError("num_windows, num_episodes, num_validation_episodes and num_validation_windows must be at least 1")
-        if not 0 < self.validation_share < 1 or not self.max_gap_steps > 0 or self.context_steps < self.history_steps:
-            raise ValueError("validation_share must lie in 0 ... 1, max_gap_steps be positive, context_steps reach the history")
-        if self.network.known_goal and not self.sources:
-            raise ValueError("network.known_goal: only episodes of `sources` say where the goal is; train without it")
-        if self.validation and not self.sources:
-            raise ValueError("validation goes with sources; logs and patrol keep some of their own episodes for it")
-        if self.sources and (self.network.num_steps, self.history_steps) != (NUM_STEPS, 1):
-            raise ValueError(f"windows of sources have {NUM_STEPS} steps from now on: network.num_steps, history_steps = 1")
-        if not 0 <= self.hidden_goals <= 1:
-            raise ValueError("hidden_goals must lie in 0 ... 1")
-        if self.network.elapsed and self.relative:
-            raise ValueError("network.elapsed needs the time since the mission's start, which a relative model does not have")
-
-    def model_config(self, centre_m: tuple[float, float], scale_m: float) -> AbsoluteConfig:
-        """The checkpoint's configuration for these map limits."""
-        return AbsoluteConfig(
-            self.network,
-            self.step_s,
-            self.history_steps,
-            centre_m,
-            scale_m,
-            self.relative,
-            self.clip,
-            float(self.context_steps),
-            self.network.known_goal and self.hidden_goals > 0,
-        )
-
-
-def train_absolute(out: Path, config: "TrainConfig", progress: Progress, force: bool = False) -> StageResult:
+def train_absolute(out: Path, config: TrainConfig, progress: Progress, force: bool = False) -> StageResult:
     """Train the paper's preset into `out`; see `pipeline.train.stage.train`.
 
     From `config.paper.sources`, or else from the logs in `config.data`, or without these from the simulator.
@@ -161,7 +78,7 @@ class _Source(Protocol):
         ...
 
 
-def _source(out: Path, config: "TrainConfig", progress: Progress) -> _Source:
+def _source(out: Path, config: TrainConfig, progress: Progress) -> _Source:
     if config.paper.sources:
         if config.data is not None:
             raise ConfigError("train.data and train.paper.sources: both say what to train on; give one of them")
@@ -172,7 +89,7 @@ def _source(out: Path, config: "TrainConfig", progress: Progress) -> _Source:
 class _EpisodeSource:
     """Windows cut out of episodes of one target when they are needed, every step of every episode equally likely."""
 
-    def __init__(self, cache: Path, config: "TrainConfig", progress: Progress) -> None:
+    def __init__(self, cache: Path, config: TrainConfig, progress: Progress) -> None:
         paper = config.paper
         load = functools.partial(load_pool, cache=cache, step_s=paper.step_s, where="train.paper", progress=progress)
         self.pool, self.paper, self.seed = load(paper.sources), paper, config.seed
@@ -207,7 +124,7 @@ class _EpisodeSource:
 class _LogSource:
     """Windows of a folder of logs; some of the logs, whole, are for validation."""
 
-    def __init__(self, out: Path, config: "TrainConfig", progress: Progress) -> None:
+    def __init__(self, out: Path, config: TrainConfig, progress: Progress) -> None:
         assert config.data is not None
         paper = config.paper
         missions = missions_of_logs(config.data, out / "logs", config.extract, progress)
@@ -231,7 +148,7 @@ class _LogSource:
 class _PatrolSource:
     """Windows of simulated episodes, each a function of its seed alone; more join as the training goes on."""
 
-    def __init__(self, config: "TrainConfig") -> None:
+    def __init__(self, config: TrainConfig) -> None:
         self.config, paper = config, config.paper
         centre = paper.centre_m or (0.0, 0.0)
         self.model = paper.model_config(centre, paper.scale_m or 0.5 * paper.patrol.side_m)

@@ -5,34 +5,27 @@ import dataclasses
 import functools
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 import torch
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
-from cadence.baselines.grammi import GrammiNetwork, GrammiNetworkConfig
-from cadence.baselines.mixture import HistoryConfig, MixtureFrame, MixtureModel
-from cadence.baselines.vrnn import VrnnNetwork, VrnnNetworkConfig
+from cadence.baselines.grammi import GrammiNetwork
+from cadence.baselines.mixture import HistoryConfig, MixtureFrame
+from cadence.baselines.vrnn import VrnnNetwork
 from cadence.errors import ConfigError
 from cadence.recordings import Recordings, cut_windows
 from cadence.training.loop import Loss, Trainer
 from cadence.training.mixtures import MixtureWindows, grammi_loss, hidden_goals, mixture_windows, vrnn_loss
-from pipeline.checkpoints import CheckpointInfo, load_weights, network_config, read_info, save_checkpoint
+from pipeline.checkpoints import CheckpointInfo, expect_preset, load_weights, read_info, save_checkpoint
 from pipeline.episodes.recordings import RecordingsConfig, load_recordings
+from pipeline.estimators.mixtures import RIVALS, GrammiConfig, VrnnConfig, fresh_rival, rival_config
 from pipeline.manifest import StageResult, write_atomic
 from pipeline.progress import Progress
+from pipeline.train.config import RivalTraining, TrainConfig
 from pipeline.train.run import OUTPUTS, TrainingRun, run_training
-
-if TYPE_CHECKING:
-    from pipeline.train.stage import TrainConfig
-
-Rival = Literal["vrnn", "grammi_without_mi", "grammi"]
-RIVALS: tuple[Rival, ...] = ("vrnn", "grammi_without_mi", "grammi")
-"""Presets of this module."""
 
 _BATCHES_A_BLOCK = 32
 """Batches cut at once: cutting has a fixed cost that goes with the recordings."""
@@ -41,67 +34,7 @@ _MARGIN = 1.02
 """Map limits taken from the recordings get this much room."""
 
 
-@dataclass(frozen=True)
-class VrnnConfig:
-    """What belongs to a VRNN's checkpoint: the network, and what its numbers mean."""
-
-    network: VrnnNetworkConfig = field(default_factory=VrnnNetworkConfig)
-    frame: MixtureFrame = field(default_factory=MixtureFrame)
-
-
-@dataclass(frozen=True)
-class GrammiConfig:
-    """What belongs to a GrAMMI's checkpoint: the network, and what its numbers mean."""
-
-    network: GrammiNetworkConfig = field(default_factory=GrammiNetworkConfig)
-    frame: MixtureFrame = field(default_factory=MixtureFrame)
-
-
-@dataclass(frozen=True)
-class RivalTraining:
-    """How the learned rivals are trained; the defaults are the published values where there are any.
-
-    vrnn, grammi   the networks
-    sources        where episodes come from; without any one is simulated as the defaults of a source say
-    validation_share  of each source's episodes, whole ones, its last; at least one
-    centre_m, scale_m  the map's centre and half its side; by default from the training episodes
-    age_scale_steps, elapsed_scale_steps  ages of detections and elapsed time are counted in so many steps
-    hidden_goals   share of the windows in which the known goal is hidden
-    num_validation_windows  random ones, of the validation episodes
-    kl_weight      of the divergence in the VRNN's loss
-    mi_weight      of the cross-entropy in GrAMMI's loss
-    tuning_steps, tuning_rate  of GrAMMI with mutual information, which goes on from the model without
-    start          checkpoint to go on from; a GrAMMI may grow a posterior, and its one trunk may become one for each horizon.
-                   GrAMMI with mutual information needs one without, and trains it in the folder without_mi where none is given
-    """
-
-    vrnn: VrnnNetworkConfig = field(default_factory=VrnnNetworkConfig)
-    grammi: GrammiNetworkConfig = field(default_factory=GrammiNetworkConfig)
-    sources: tuple[RecordingsConfig, ...] = ()
-    validation_share: float = 0.1
-    centre_m: tuple[float, float] | None = None
-    scale_m: float | None = None
-    age_scale_steps: float = 4320.0
-    elapsed_scale_steps: float = 4320.0
-    hidden_goals: float = 0.5
-    num_validation_windows: int = 4000
-    kl_weight: float = 0.01
-    mi_weight: float = 2.0
-    tuning_steps: int = 4000
-    tuning_rate: float = 8e-5
-    start: Path | None = None
-
-    def __post_init__(self) -> None:
-        if not 0 < self.validation_share < 1 or not 0 <= self.hidden_goals <= 1:
-            raise ValueError("validation_share must lie between 0 and 1, hidden_goals in 0 ... 1")
-        if min(self.num_validation_windows, self.tuning_steps) < 1 or not self.tuning_rate > 0:
-            raise ValueError("num_validation_windows, tuning_steps and tuning_rate must be positive")
-        if min(self.kl_weight, self.mi_weight) < 0:
-            raise ValueError("kl_weight and mi_weight must not be negative")
-        MixtureFrame(1.0, (0.0, 0.0), self.scale_m or 1.0, self.age_scale_steps, self.elapsed_scale_steps)
-
-
-def train_rivals(out: Path, config: "TrainConfig", progress: Progress, force: bool = False) -> StageResult:
+def train_rivals(out: Path, config: TrainConfig, progress: Progress, force: bool = False) -> StageResult:
     """Train the preset of `config` on its sources into `out`; see `pipeline.train.stage.train`."""
     rival = config.rival
     kept, held_out = [], []
@@ -117,7 +50,7 @@ def train_rivals(out: Path, config: "TrainConfig", progress: Progress, force: bo
 
 def train_rival(
     out: Path,
-    config: "TrainConfig",
+    config: TrainConfig,
     recordings: Recordings,
     validation: Recordings,
     progress: Progress,
@@ -141,25 +74,8 @@ def train_rival(
     return _train(out, tuned, recordings, validation, progress, force)
 
 
-def load_rival(weights: Path, uses_goal: bool = False) -> MixtureModel:
-    """The estimator of a rival's checkpoint; `ConfigError` where it is of another preset or does not fit."""
-    info = read_info(weights)
-    config = _description(info, weights)
-    network = _fresh(config)
-    load_weights(weights, network)
-    return MixtureModel(network.eval(), config.frame, info.preset, uses_goal)
-
-
-def _description(info: CheckpointInfo, weights: Path) -> VrnnConfig | GrammiConfig:
-    """What the checkpoint says of its network."""
-    if info.preset not in RIVALS:
-        raise ConfigError(f"{weights}: a checkpoint of the preset {info.preset!r}, expected one of {', '.join(RIVALS)}")
-    found: VrnnConfig | GrammiConfig = network_config(VrnnConfig if info.preset == "vrnn" else GrammiConfig, info, weights)
-    return found
-
-
 def _train(
-    out: Path, config: "TrainConfig", recordings: Recordings, validation: Recordings, progress: Progress, force: bool
+    out: Path, config: TrainConfig, recordings: Recordings, validation: Recordings, progress: Progress, force: bool
 ) -> StageResult:
     """One training; `config.rival.start` gives the weights to begin with, as far as the network has them."""
     rival, optimiser = config.rival, config.optimiser
@@ -192,21 +108,15 @@ def _train(
     return best.ship(result, trainer.ema.network)
 
 
-def _fresh(description: VrnnConfig | GrammiConfig) -> VrnnNetwork | GrammiNetwork:
-    if isinstance(description, VrnnConfig):
-        return VrnnNetwork(description.network)
-    return GrammiNetwork(description.network)
-
-
 def _network(description: VrnnConfig | GrammiConfig, start: Path | None) -> VrnnNetwork | GrammiNetwork:
     """A fresh network, or one that begins with the weights of `start`."""
-    network = _fresh(description)
+    network = fresh_rival(description)
     if start is None:
         return network
-    before = _description(read_info(start), start)
+    before = rival_config(expect_preset(start, *RIVALS), start)
     if not _grows_into(before, description):
         raise ConfigError(f"{start}: not the same network or map; set train.rival alike")
-    trained = _fresh(before)
+    trained = fresh_rival(before)
     load_weights(start, trained)
     if isinstance(network, GrammiNetwork) and isinstance(trained, GrammiNetwork):
         trained.trunks.extend(copy.deepcopy(trained.trunks[0]) for _ in network.trunks[len(trained.trunks) :])

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
@@ -16,17 +16,15 @@ from torch import nn
 
 from cadence.errors import InputError
 from cadence.training.loop import Loss, Trainer
-from pipeline.checkpoints import CheckpointInfo, read_info, save_checkpoint, windows_seen
+from pipeline.checkpoints import WEIGHTS_NAME, CheckpointInfo, read_info, save_checkpoint, windows_seen
 from pipeline.config import config_as_dict
 from pipeline.manifest import StageResult, write_atomic
 from pipeline.progress import Progress
-
-if TYPE_CHECKING:
-    from pipeline.train.stage import TrainConfig
+from pipeline.train.config import TrainConfig
 
 Curve = list[tuple[int, float, float]]
 """(step, training loss, validation loss) of every validation."""
-OUTPUTS = ("checkpoint.safetensors", "checkpoint.json", "curve.csv", "curve.png")
+OUTPUTS = (WEIGHTS_NAME, "checkpoint.json", "curve.csv", "curve.png")
 
 
 @dataclass(frozen=True)
@@ -43,7 +41,7 @@ class TrainingRun:
 
     out: Path
     preset: str
-    config: "TrainConfig"
+    config: TrainConfig
     network: object
     num_steps: int
     start: Path | None = None

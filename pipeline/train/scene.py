@@ -1,9 +1,7 @@
 """Training of the scene preset: one place learned by heart, from the episodes of a world or of a folder of logs."""
 
 import dataclasses
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 import torch
@@ -13,67 +11,18 @@ from cadence.diffusion.scene_frame import SceneConfig
 from cadence.network.attention import Team
 from cadence.network.scene import Pieces, SceneInputs, SceneNetwork
 from cadence.training.loop import Loss, Trainer
-from cadence.training.scene import Dropout, SceneWindows, diffusion_loss, energy_loss, scene_windows
+from cadence.training.scene import SceneWindows, diffusion_loss, energy_loss, scene_windows
 from pipeline.checkpoints import find_checkpoint, load_weights
-from pipeline.episodes.pool import EpisodePool, EpisodeSource, load_pool
-from pipeline.episodes.recordings import RecordingsConfig
+from pipeline.episodes.pool import EpisodePool, load_pool
 from pipeline.manifest import StageResult
 from pipeline.progress import Progress
+from pipeline.train.config import SceneTraining, TrainConfig
 from pipeline.train.run import TrainingRun, run_training
-
-if TYPE_CHECKING:
-    from pipeline.train.stage import TrainConfig
 
 _VALIDATION_BATCH = 250
 
 
-def _worlds() -> tuple[EpisodeSource, ...]:
-    return tuple(EpisodeSource(1.0, RecordingsConfig(set=name, num_episodes=4000)) for name in ("low", "med", "high"))
-
-
-def _validation() -> tuple[EpisodeSource, ...]:
-    return tuple(EpisodeSource(1.0, RecordingsConfig(set=name, num_episodes=50, seed=1)) for name in ("low", "med", "high"))
-
-
-@dataclass(frozen=True)
-class SceneTraining:
-    """What the scene preset is trained on, and for what.
-
-    model           sizes, inputs and units; few_steps is set by the objective "energy"
-    objective       "diffusion" (noise levels at random), or "energy": a few-step sampler tuned by the energy score
-    start           checkpoint that the training starts from; "energy" needs one
-    sources         episodes to train on
-    validation      episodes to validate on
-    num_validation_windows  of each source
-    told            which windows are told of the start, the goal and the trackers
-    path_weight     of the positions' error beside that of the pieces, for "diffusion"
-    few_steps       evaluations of the sampler, for "energy"
-    num_samples     tracks a window, for "energy"
-    score_weights   of the whole track and of single pieces beside the positions, for "energy"
-    """
-
-    model: SceneConfig = field(default_factory=SceneConfig)
-    objective: Literal["diffusion", "energy"] = "diffusion"
-    start: str | None = None
-    sources: tuple[EpisodeSource, ...] = field(default_factory=_worlds)
-    validation: tuple[EpisodeSource, ...] = field(default_factory=_validation)
-    num_validation_windows: int = 1000
-    told: Dropout = field(default_factory=Dropout)
-    path_weight: float = 1.0
-    few_steps: int = 2
-    num_samples: int = 4
-    score_weights: tuple[float, float] = (0.3, 0.3)
-
-    def __post_init__(self) -> None:
-        if not self.sources or not self.validation:
-            raise ValueError("sources and validation must name episodes")
-        if self.few_steps < 1 or self.num_samples < 2 or self.num_validation_windows < 1:
-            raise ValueError("few_steps and num_validation_windows must be at least 1, num_samples at least 2")
-        if self.objective == "energy" and self.start is None:
-            raise ValueError("the objective 'energy' tunes a trained network: name its checkpoint in start")
-
-
-def train_scene(out: Path, config: "TrainConfig", progress: Progress, force: bool = False) -> StageResult:
+def train_scene(out: Path, config: TrainConfig, progress: Progress, force: bool = False) -> StageResult:
     """Train the scene preset into `out`; see `pipeline.train.stage.train`."""
     scene, cache = config.scene, out / "episodes"
     model = _model_config(scene)
@@ -97,7 +46,7 @@ def untrained_network(model: SceneConfig, seed: int) -> SceneNetwork:
 
 def train_scene_network(
     out: Path,
-    config: "TrainConfig",
+    config: TrainConfig,
     network: SceneNetwork,
     pool: EpisodePool,
     held_out: EpisodePool,

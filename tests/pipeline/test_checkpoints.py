@@ -19,7 +19,8 @@ from pipeline.checkpoints import (
     save_checkpoint,
 )
 from pipeline.config import config_as_dict
-from pipeline.infer.stage import InferConfig, load_model
+from pipeline.estimators.general import load_general
+from pipeline.estimators.samplings import Samplings
 
 SMALL = ResidualNetworkConfig(width=8, multipliers=(1, 2), encoder_size=8, level_size=8)
 INFO = CheckpointInfo("general", config_as_dict(SMALL), {"steps": 3}, {"validation_loss": 0.5})
@@ -71,7 +72,7 @@ def test_the_hash_tells_weights_and_description(saved: Path) -> None:
 
 def test_the_shipped_checkpoint_is_whole() -> None:
     path = find_checkpoint(DEFAULT)
-    model = load_model(InferConfig(device="cpu"), path)
+    model = load_general(path, Samplings(device="cpu")).estimator
     assert model.network is not None and not model.network.training
     assert all(torch.isfinite(value).all() for value in model.network.state_dict().values())
 
@@ -130,15 +131,15 @@ def test_weights_that_are_damaged(saved: Path) -> None:
 
 def test_models_of_other_presets_and_devices(saved: Path) -> None:
     edit(saved, preset="paper")
-    error = one_line(load_model, InferConfig(device="cpu"), saved)
+    error = one_line(load_general, saved, Samplings(device="cpu"))
     assert isinstance(error, ConfigError) and "paper" in str(error)
     edit(saved, preset="general", network={"wdith": 8})
-    error = one_line(load_model, InferConfig(device="cpu"), saved)
+    error = one_line(load_general, saved, Samplings(device="cpu"))
     assert isinstance(error, ConfigError) and "wdith" in str(error)
     edit(saved, network={"width": 9})  # refused by the U-Net: not a multiple of its groups
-    assert isinstance(one_line(load_model, InferConfig(device="cpu"), saved), ConfigError)
+    assert isinstance(one_line(load_general, saved, Samplings(device="cpu")), ConfigError)
     for name in ("cuda:99", "toaster"):
-        error = one_line(load_model, InferConfig(device=name), None)
+        error = one_line(load_general, None, Samplings(device=name))
         assert isinstance(error, DeviceError) and name in str(error)
 
 

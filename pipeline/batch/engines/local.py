@@ -13,7 +13,8 @@ from multiprocessing.context import ForkServerContext, ForkServerProcess
 from types import FrameType
 
 from cadence.errors import DeviceError
-from pipeline.batch.tasks import LogOutcome, LogTask, RunTask, Watch
+from pipeline.batch.outcome import LogOutcome, LogTask
+from pipeline.batch.tasks import RunTask, Watch
 from pipeline.progress import RelayedProgress, Told
 
 _GRACE_S = 10.0

@@ -14,7 +14,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from cadence.errors import ConfigError, DeviceError
-from pipeline.batch.tasks import LogOutcome, LogTask, RunTask, Watch
+from pipeline.batch.outcome import LogOutcome, LogTask
+from pipeline.batch.tasks import RunTask, Watch
 from pipeline.progress import RelayedProgress, Told
 from pipeline.stores.urls import is_url
 

@@ -56,7 +56,7 @@ def cut(recordings: Recordings, number: int, **options: bool) -> ForecastWindows
 
 
 def ask(library: TrajectoryLibrary, windows: ForecastWindows, number: int = 8) -> torch.Tensor:
-    return library.placed(windows.context).sample(windows.windows, number).position_m
+    return library.sample(windows.windows, number).position_m
 
 
 def test_continues_along_the_branch_that_was_taken() -> None:
@@ -78,7 +78,7 @@ def test_the_call_is_that_of_every_estimator(config: LibraryConfig, known_start:
     estimator: Estimator = library
     assert estimator.fit(cut(NOW, 2).windows.detections) is library
     windows = cut(NOW, 20, known_start=known_start)
-    found = library.placed(windows.context).sample(windows.windows, 6)
+    found = library.sample(windows.windows, 6)
     assert tuple(found.position_m.shape) == (20, 6, 1, 120, 2)
     assert torch.isfinite(found.position_m[windows.windows.is_active[:, 0]]).all()
     assert torch.allclose(found.weight.sum(1), torch.ones(20, dtype=found.weight.dtype))
@@ -183,8 +183,8 @@ def test_lags_grow() -> None:
 
 def test_misuse_is_refused() -> None:
     library = TrajectoryLibrary.from_recordings(RECORDED)
-    with pytest.raises(ValueError, match="placed"):
-        library.sample(cut(NOW, 2).windows, 3)
+    with pytest.raises(ValueError, match="where they are"):
+        library.sample(cut(NOW, 2).windows.with_context(None), 3)
     with pytest.raises(ValueError, match="no episodes"):
         TrajectoryLibrary.from_recordings(RECORDED.select(slice(0, 0)))
     with pytest.raises(ValueError, match="positive"):

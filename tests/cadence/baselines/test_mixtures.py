@@ -141,8 +141,7 @@ def test_tracks_are_straight_between_the_draws():
 def test_samples_pass_through_the_mixtures_draws():
     found = windows()
     for model in models():
-        placed = model.placed(found.context)
-        mixture, drawn = placed.mixture(found.windows), placed.sample(found.windows, 5)
+        mixture, drawn = model.mixture(found.windows), model.sample(found.windows, 5)
         assert mixture.weight.shape == (12, 5, 4) and drawn.position_m.shape == (12, 5, 1, 120, 2)
         points = mixture.sample(5, found.windows.seeds)
         torch.testing.assert_close(drawn.position_m[:, :, 0, list(HORIZONS)], points)
@@ -153,16 +152,16 @@ def test_samples_pass_through_the_mixtures_draws():
 def test_what_a_window_gets_does_not_depend_on_its_neighbours():
     found = windows()
     for model in models(draws_latents=True, rows_at_once=5):
-        whole = model.placed(found.context).sample(found.windows, 3).position_m
+        whole = model.sample(found.windows, 3).position_m
         pick = torch.tensor([7, 2])
         part = found[pick]
-        again = model.placed(part.context).sample(part.windows, 3).position_m
+        again = model.sample(part.windows, 3).position_m
         torch.testing.assert_close(again, whole[pick], rtol=0, atol=0.02)  # float32 in units of 500 m
 
 
 def test_latent_draws_follow_the_seed_and_their_mean_is_free_of_noise():
     found = windows()
-    model = models(draws_latents=True)[1].placed(found.context)
+    model = models(draws_latents=True)[1]
     other = dataclasses.replace(found.windows, seeds=found.windows.seeds + 1)
     first, second = model.mixture(found.windows), model.mixture(other)
     assert torch.equal(first.mean_m, model.mixture(found.windows).mean_m)
@@ -175,16 +174,16 @@ def test_the_order_of_the_trackers_does_not_matter_and_absent_ones_are_not_there
     found = windows()
     model = models()[0]
     tracker = found.context.tracker_m
-    here = model.placed(found.context).mixture(found.windows)
+    here = model.mixture(found.windows)
     swapped = dataclasses.replace(found.context, tracker_m=tracker[:, :, [2, 0, 1]])
     more = torch.cat([torch.full_like(tracker[:, :, :2], torch.nan), tracker], dim=2)
     for context in (swapped, dataclasses.replace(found.context, tracker_m=more)):
-        same = model.placed(context).mixture(found.windows)
+        same = model.mixture(found.windows.with_context(context))
         torch.testing.assert_close(same.mean_m, here.mean_m, rtol=0, atol=0.02)
     fewer = dataclasses.replace(found.context, tracker_m=tracker[:, :, :2])
-    assert not torch.allclose(model.placed(fewer).mixture(found.windows).mean_m, here.mean_m, atol=0.1)
+    assert not torch.allclose(model.mixture(found.windows.with_context(fewer)).mean_m, here.mean_m, atol=0.1)
     for nobody in (None, tracker[:, :, :0], torch.full_like(tracker, torch.nan)):
-        alone = model.placed(dataclasses.replace(found.context, tracker_m=nobody)).mixture(found.windows)
+        alone = model.mixture(found.windows.with_context(dataclasses.replace(found.context, tracker_m=nobody)))
         assert torch.isfinite(alone.mean_m).all()
 
 
@@ -204,13 +203,13 @@ def test_a_known_goal_is_read_only_where_it_is_wanted():
     nowhere = dataclasses.replace(found.context, known_goal_m=torch.full((12, 1, 2), torch.nan, dtype=torch.float64))
     elsewhere = dataclasses.replace(found.context, known_goal_m=found.context.known_goal_m + 100.0)
     for model in models():
-        blind = model.placed(found.context).mixture(found.windows).mean_m
-        assert torch.equal(model.placed(nowhere).mixture(found.windows).mean_m, blind)
+        blind = model.mixture(found.windows).mean_m
+        assert torch.equal(model.mixture(found.windows.with_context(nowhere)).mean_m, blind)
         knowing = dataclasses.replace(model, uses_goal=True)
-        seeing = knowing.placed(found.context).mixture(found.windows).mean_m
+        seeing = knowing.mixture(found.windows).mean_m
         assert not torch.allclose(seeing, blind, atol=0.1)
-        assert not torch.allclose(knowing.placed(elsewhere).mixture(found.windows).mean_m, seeing, atol=0.1)
-        assert torch.equal(knowing.placed(nowhere).mixture(found.windows).mean_m, blind)
+        assert not torch.allclose(knowing.mixture(found.windows.with_context(elsewhere)).mean_m, seeing, atol=0.1)
+        assert torch.equal(knowing.mixture(found.windows.with_context(nowhere)).mean_m, blind)
     batch = mixture_windows(found, FRAME, HISTORY, HORIZONS)
     hidden = hidden_goals(batch, 1.0, torch.Generator().manual_seed(0)).inputs.extra(HISTORY)
     assert hidden[:, 1:].abs().max() == 0 and hidden_goals(batch, 0.0, torch.Generator()).inputs.has_goal.all()
@@ -221,16 +220,15 @@ def test_windows_without_detections_are_not_answered():
     rec.is_detected[: rec.offset[1]] = False
     found = cut_windows(rec, np.array([0, 2]), np.array([30, 250]), known_start=False, num_tracker_steps=8)
     for model in models():
-        placed = model.placed(found.context)
-        assert torch.isnan(placed.mixture(found.windows).mean_m[0]).all()
-        drawn = placed.sample(found.windows, 2)
+        assert torch.isnan(model.mixture(found.windows).mean_m[0]).all()
+        drawn = model.sample(found.windows, 2)
         assert drawn.status == (("no_detections",), ("ok",))
         assert torch.isnan(drawn.position_m[0]).all() and torch.isfinite(drawn.position_m[1]).all()
 
 
 def test_inputs_are_normalised_and_left_packed():
     found = windows()
-    inputs = mixture_inputs(found.windows, found.context, FRAME, dataclasses.replace(HISTORY, tracker_stride=3))
+    inputs = mixture_inputs(found.windows, FRAME, dataclasses.replace(HISTORY, tracker_stride=3))
     detections, row = found.windows.detections, int(found.step.argmax())
     count = min(20, int(detections.count[row, 0]))
     last = inputs.rows[row, count - 1]
@@ -245,7 +243,7 @@ def test_inputs_are_normalised_and_left_packed():
     half = inputs[torch.tensor([row])]
     assert half.rows.shape == (1, count, 3) and half.extra(HISTORY).shape == (1, 4)
     with pytest.raises(ConfigError, match="time since"):
-        mixture_inputs(found.windows, Context(found.context.datum_m), FRAME, HISTORY)
+        mixture_inputs(found.windows.with_context(Context(found.context.datum_m)), FRAME, HISTORY)
 
 
 def test_sequences_encoded_in_groups_are_those_encoded_at_once():
@@ -355,12 +353,12 @@ def test_settings_and_grids_that_cannot_be():
             bad()
     found = windows(3)
     model = models()[0]
-    with pytest.raises(ValueError, match="placed"):
-        model.mixture(found.windows)
+    with pytest.raises(ValueError, match="where they are"):
+        model.mixture(found.windows.with_context(None))
     short = dataclasses.replace(found.windows, time_s=found.windows.time_s[:60])
     with pytest.raises(ConfigError, match="horizon_steps = 119"):
-        model.placed(found.context).mixture(short)
+        model.mixture(short.with_context(found.context))
     slow = dataclasses.replace(found.windows, time_s=2 * found.windows.time_s)
     with pytest.raises(ConfigError, match="step_s = 60"):
-        model.placed(found.context).mixture(slow)
+        model.mixture(slow.with_context(found.context))
     assert model.fit(found.windows.detections) is model

@@ -60,7 +60,7 @@ def test_motion_is_found_again() -> None:
 def test_a_steady_track_goes_on() -> None:
     rec = straight()
     windows = cut_windows(rec, np.array([0]), np.array([80]))
-    found = ParticleFilter(STEADY).placed(windows.context).sample(windows.windows, 50).position_m
+    found = ParticleFilter(STEADY).sample(windows.windows, 50).position_m
     error = torch.linalg.vector_norm(found.mean(1) - windows.truth_m, dim=-1)[0, 0]
     assert float(error[0]) < 200.0 and float(error[60]) < 1500.0
     way = torch.diff(found[0, :, 0], dim=1).norm(dim=-1)

@@ -34,7 +34,7 @@ def test_straight_tracks_are_continued(kalman: ConstantVelocityKalman) -> None:
     rec = recorded(noise_m=20.0)
     rival = RecordedKalman.from_recordings(rec, kalman)
     windows = cut_windows(rec, np.arange(8), np.full(8, 150))
-    found = rival.placed(windows.context).sample(windows.windows, 60)
+    found = rival.sample(windows.windows, 60)
     error = torch.linalg.vector_norm(found.position_m.mean(1) - windows.truth_m, dim=-1)
     assert float(error[..., 30].mean()) < 0.05 * 100.0 * 150
     assert rival.waver_m == pytest.approx(20.0 * np.sqrt(1.5), rel=0.1)

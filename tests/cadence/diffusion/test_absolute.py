@@ -35,17 +35,22 @@ def batch(b=3, a=2, n=4, seed=0, origin=0, num_steps=16):
     observed[1, 1] = False
     covariance = torch.zeros(b, a, n, 2, 2, dtype=torch.float64)
     grid = 2.0 * (torch.arange(num_steps).double() - origin)
-    return WindowBatch(grid, Detections(time, position, covariance, observed), torch.arange(7, 7 + b), origin)
+    context = Context(torch.tensor([[120.0, 40.0]]).double().expand(b, 2))
+    return WindowBatch(grid, Detections(time, position, covariance, observed), torch.arange(7, 7 + b), origin, context)
 
 
-def model(sampling=FAST, config=CONFIG, b=3, **changes):
+def among(obstacles, windows):
+    """The same windows with obstacles in the mission frame."""
+    return windows.with_context(dataclasses.replace(windows.context, obstacles=obstacles))
+
+
+def model(sampling=FAST, config=CONFIG, **changes):
     network = TrajectoryNetwork(config.network)
     generator = torch.Generator().manual_seed(1)
     with torch.no_grad():
         for parameter in network.parameters():
             parameter.copy_(0.1 * torch.randn(parameter.shape, generator=generator))
-    context = Context(torch.tensor([[120.0, 40.0]]).double().expand(b, 2))
-    return AbsoluteModel(network.eval(), config, sampling, context, **changes)
+    return AbsoluteModel(network.eval(), config, sampling, **changes)
 
 
 def test_shapes_status_and_inactive_agents():
@@ -62,7 +67,7 @@ def test_same_seed_same_bytes_and_windows_do_not_matter_to_each_other(sampling):
     windows, estimator = batch(), model(sampling)
     first = estimator.sample(windows, 4).position_m
     assert torch.equal(first.nan_to_num(), estimator.sample(windows, 4).position_m.nan_to_num())
-    alone = model(sampling, b=1).sample(windows[2:], 4).position_m
+    alone = model(sampling).sample(windows[2:], 4).position_m
     torch.testing.assert_close(alone[0], first[2], rtol=0, atol=2e-3)
     in_chunks = model(dataclasses.replace(sampling, chunk=4)).sample(windows, 4).position_m
     torch.testing.assert_close(in_chunks, first, equal_nan=True, rtol=0, atol=2e-3)
@@ -109,8 +114,8 @@ def test_guidance_without_anything_to_obey_is_no_guidance():
     free = model().sample(windows, 3).position_m.nan_to_num()
     assert torch.equal(model(dataclasses.replace(FAST, guidance="clean")).sample(windows, 3).position_m.nan_to_num(), free)
     far = Obstacles(torch.tensor([[1e6, 1e6, 5.0]], dtype=torch.float64))
-    guided = model(dataclasses.replace(FAST, guidance="clean", max_speed_mps=1e6), obstacles=far)
-    torch.testing.assert_close(guided.sample(windows, 3).position_m.nan_to_num(), free, rtol=0, atol=1e-3)
+    guided = model(dataclasses.replace(FAST, guidance="clean", max_speed_mps=1e6))
+    torch.testing.assert_close(guided.sample(among(far, windows), 3).position_m.nan_to_num(), free, rtol=0, atol=1e-3)
     ddpm = AbsoluteSampling("ddpm", inpainting="overwrite")
     still = dataclasses.replace(ddpm, guidance="paper", iterations=0)
     assert torch.equal(
@@ -121,10 +126,10 @@ def test_guidance_without_anything_to_obey_is_no_guidance():
 def test_clean_guidance_leaves_obstacles_and_keeps_detections():
     config = dataclasses.replace(CONFIG, network=dataclasses.replace(NETWORK, prediction="x0"))
     windows = batch()[torch.tensor([2])]
-    free = model(FAST, config, b=1).sample(windows, 20).position_m
+    free = model(FAST, config).sample(windows, 20).position_m
     hill = Obstacles(torch.tensor([[80.0, 60.0, 60.0]], dtype=torch.float64))
     sampling = dataclasses.replace(FAST, guidance="clean")
-    guided = model(sampling, config, b=1, obstacles=hill).sample(windows, 20).position_m
+    guided = model(sampling, config).sample(among(hill, windows), 20).position_m
 
     def inside(track):
         offset = torch.tensor([120.0, 40.0]).double()
@@ -162,12 +167,12 @@ def test_absolute_networks_know_the_map_and_relative_ones_do_not():
     datum = Context(torch.tensor([[120.0, 40.0]]).double().expand(3, 2) + shift)
     found = model().sample(windows, 3).position_m
     torch.testing.assert_close(
-        model().placed(datum).sample(elsewhere, 3).position_m + shift, found, equal_nan=True, rtol=0, atol=2e-3
+        model().sample(elsewhere.with_context(datum), 3).position_m + shift, found, equal_nan=True, rtol=0, atol=2e-3
     )
     assert not torch.allclose(model().sample(elsewhere, 3).position_m[0] + shift, found[0], atol=1.0)
-    relative = dataclasses.replace(model(config=dataclasses.replace(CONFIG, relative=True)), context=None)
+    relative = model(config=dataclasses.replace(CONFIG, relative=True))
     torch.testing.assert_close(
-        relative.sample(elsewhere, 3).position_m + shift, relative.sample(windows, 3).position_m,
+        relative.sample(elsewhere.with_context(None), 3).position_m + shift, relative.sample(windows, 3).position_m,
         equal_nan=True, rtol=0, atol=2e-3,
     )  # fmt: skip
 
@@ -177,12 +182,12 @@ def test_goal_and_elapsed_reach_the_network():
     windows, estimator = batch(), model(config=config)
     with pytest.raises(ConfigError, match="goal"):
         estimator.sample(windows, 2)
-    context = dataclasses.replace(estimator.context, known_goal_m=torch.zeros(3, 2, 2).double(), elapsed_s=torch.zeros(3))
-    near = estimator.placed(context).sample(windows, 2).position_m
+    context = dataclasses.replace(windows.context, known_goal_m=torch.zeros(3, 2, 2).double(), elapsed_s=torch.zeros(3))
+    near = estimator.sample(windows.with_context(context), 2).position_m
     later = dataclasses.replace(context, elapsed_s=torch.full((3,), 1e4))
     there = dataclasses.replace(context, known_goal_m=torch.full((3, 2, 2), 90.0).double())
     for other in (later, there):
-        assert not torch.allclose(estimator.placed(other).sample(windows, 2).position_m[0], near[0], atol=0.01)
+        assert not torch.allclose(estimator.sample(windows.with_context(other), 2).position_m[0], near[0], atol=0.01)
 
 
 def test_what_does_not_fit_is_refused():
@@ -190,10 +195,10 @@ def test_what_does_not_fit_is_refused():
         model().sample(batch(origin=4), 2)
     with pytest.raises(ConfigError, match="step_s = 2"):
         model().sample(dataclasses.replace(batch(), time_s=batch().time_s * 2), 2)
-    with pytest.raises(ValueError, match="placed"):
-        dataclasses.replace(model(), context=None).sample(batch(), 2)
+    with pytest.raises(ValueError, match="where they are"):
+        model().sample(batch().with_context(None), 2)
     with pytest.raises(ValueError, match="context of 1"):
-        model(b=1).sample(batch(), 2)
+        batch().with_context(Context(torch.zeros(1, 2).double()))
     with pytest.raises(ValueError, match="ddpm"):
         AbsoluteSampling("ddim", guidance="paper")
     with pytest.raises(ValueError, match="history_steps"):
@@ -257,7 +262,7 @@ def test_one_batch_is_learned_by_heart():
         AbsoluteSampling("ddpm", inpainting="overwrite"),
         AbsoluteSampling(),
     ):
-        found = AbsoluteModel(network.eval(), config, sampling, centre).sample(at, 8).position_m[:, :, 0]
+        found = AbsoluteModel(network.eval(), config, sampling).sample(at.with_context(centre), 8).position_m[:, :, 0]
         error = (found - truth[:, None]).norm(dim=-1).mean()
         other = (found - truth.roll(1, 0)[:, None]).norm(dim=-1).mean()
         assert error < 30.0 and other > 3 * error

@@ -9,9 +9,9 @@ from test_general import network
 from cadence.bank.bank import Bank
 from cadence.constraints.checker import segments_in_collision, states_in_collision
 from cadence.constraints.obstacles import Obstacles
-from cadence.diffusion.feasible import Feasibility, resampled
+from cadence.diffusion.feasible import Feasibility, GuidanceConfig, resampled
 from cadence.diffusion.general import GeneralModel
-from cadence.types import Detections, WindowBatch
+from cadence.types import Context, Detections, WindowBatch
 
 NUM = 8
 DATUM = torch.tensor([[1000.0, -500.0], [3000.0, 200.0]], dtype=torch.float64)
@@ -48,8 +48,9 @@ LIMITS = Feasibility(OBSTACLES, 0.0, None, 1.0, DATUM[:, None, None])
 NO_LIMITS = dataclasses.replace(LIMITS, obstacles=Obstacles.none())
 
 
-def sampled(model: GeneralModel) -> torch.Tensor:
-    return model.sample(WINDOWS, NUM).position_m[:, :, 0]
+def sampled(limits: Feasibility | None = None) -> torch.Tensor:
+    """What the network makes of the bank's samples, guided but not repaired."""
+    return MODEL.denoised(POSTERIOR, WINDOWS, None if limits is None else limits.guide)
 
 
 def num_inside(position: torch.Tensor) -> int:
@@ -57,7 +58,7 @@ def num_inside(position: torch.Tensor) -> int:
 
 
 def test_guidance_leads_out_and_repair_finishes() -> None:
-    plain, guided = sampled(MODEL), sampled(dataclasses.replace(MODEL, guide=LIMITS.guide))
+    plain, guided = sampled(), sampled(LIMITS)
     assert num_inside(guided) < 0.5 * num_inside(plain)
     moved, weight, is_feasible = LIMITS.finish(guided, POSTERIOR.sigma_m, LENGTH_M)
     assert is_feasible.all() and num_inside(moved) == 0
@@ -70,12 +71,24 @@ def test_guidance_leads_out_and_repair_finishes() -> None:
 
 
 def test_without_obstacles_guided_is_unguided() -> None:
-    plain = sampled(MODEL)
-    guided = sampled(dataclasses.replace(MODEL, guide=NO_LIMITS.guide))
+    plain, guided = sampled(), sampled(NO_LIMITS)
     torch.testing.assert_close(guided, plain, atol=1e-4 * LENGTH_M, rtol=1e-4)
     moved, weight, is_feasible = NO_LIMITS.finish(plain, POSTERIOR.sigma_m, LENGTH_M)
     assert moved is plain and is_feasible.all()
     assert torch.equal(weight, torch.full((2, NUM), 1.0 / NUM, dtype=torch.float64))
+
+
+def test_samples_obey_the_obstacles_of_the_windows() -> None:
+    """`sample` is guidance, repair and weights in one; without a context or with mode "none" there is nothing to obey."""
+    here = WINDOWS.with_context(Context(DATUM, obstacles=OBSTACLES))
+    found = MODEL.sample(here, NUM)
+    moved, weight, _ = LIMITS.finish(sampled(LIMITS), BANK.posterior(WINDOWS, 1).sigma_m, LENGTH_M)
+    assert torch.equal(found.position_m[:, :, 0], moved) and torch.equal(found.weight, weight)
+    assert num_inside(found.position_m[:, :, 0]) == 0
+    plain = MODEL.sample(WINDOWS, NUM)
+    assert torch.equal(plain.position_m[:, :, 0], sampled())
+    careless = dataclasses.replace(MODEL, guidance=GuidanceConfig("none")).sample(here, NUM)
+    assert torch.equal(careless.position_m, plain.position_m)
 
 
 def test_guidance_keeps_what_is_certain_and_what_is_clear() -> None:
@@ -101,7 +114,7 @@ def test_a_speed_limit_slows_down() -> None:
 
 def test_margin_is_kept() -> None:
     wide = dataclasses.replace(LIMITS, margin_m=0.4)
-    moved, _, is_feasible = wide.finish(sampled(MODEL), POSTERIOR.sigma_m, LENGTH_M)
+    moved, _, is_feasible = wide.finish(sampled(), POSTERIOR.sigma_m, LENGTH_M)
     assert is_feasible.all()
     distance, _ = OBSTACLES.signed_distance(moved, offset_m=DATUM[:, None, None])
     assert distance.median() > 0.4 and (distance > 0.39).double().mean() > 0.98

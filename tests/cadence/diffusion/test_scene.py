@@ -58,7 +58,7 @@ def model(sampling: SceneSampling | None = None, config: SceneConfig = CONFIG, s
 
 def test_a_track_is_the_sum_of_its_pieces() -> None:
     cut, rec = windows(), recordings()
-    inputs = scene_inputs(cut.windows, cut.context, CONFIG)
+    inputs = scene_inputs(cut.windows, CONFIG)
     rows = rec.offset[cut.episode.numpy()] + cut.step.numpy()
     track = recorded_track(rec, rows, cut.episode.numpy(), inputs.pieces)
     pieces = to_pieces(track, inputs.pieces, CONFIG)
@@ -71,10 +71,10 @@ def test_a_track_is_the_sum_of_its_pieces() -> None:
 
 def test_inputs_do_not_depend_on_padding_or_neighbours() -> None:
     cut = windows()
-    together = scene_inputs(cut.windows, cut.context, CONFIG)
+    together = scene_inputs(cut.windows, CONFIG)
     for row in range(len(cut)):
         one = cut[row : row + 1]
-        alone = scene_inputs(one.windows, one.context, CONFIG)
+        alone = scene_inputs(one.windows, CONFIG)
         assert torch.equal(alone.summary, together.summary[row : row + 1])
         count = int(alone.is_observed.sum())
         assert torch.equal(alone.rows[0, :count], together.rows[row, :count])
@@ -85,7 +85,7 @@ def test_all_detections_are_read_where_they_fit_and_otherwise_the_last_ones_and_
     rec = recordings()
     rec.is_detected[:] = True
     cut = cut_windows(rec, np.array([2, 2]), np.array([6, 25]))
-    inputs = scene_inputs(cut.windows, cut.context, CONFIG)
+    inputs = scene_inputs(cut.windows, CONFIG)
     ages = (inputs.rows[..., 1] * 200.0).round()
     assert ages[0, :7].tolist() == list(range(6, -1, -1)) and int(inputs.is_observed[0].sum()) == 7
     assert ages[1, 0] == 25 and ages[1, -8:].tolist() == list(range(7, -1, -1)) and bool(inputs.is_observed[1].all())
@@ -98,7 +98,7 @@ def test_trackers_are_a_set_and_a_goal_that_is_not_told_is_none() -> None:
     assert context.tracker_m is not None and context.known_goal_m is not None
 
     def code(**changes: object) -> torch.Tensor:
-        return network.encode(scene_inputs(cut.windows, dataclasses.replace(context, **changes), CONFIG)).detach()
+        return network.encode(scene_inputs(cut.windows.with_context(dataclasses.replace(context, **changes)), CONFIG)).detach()
 
     assert torch.allclose(code(), code(tracker_m=context.tracker_m[:, :, [2, 0, 1]]), atol=1e-5)
     assert not torch.allclose(code(), code(tracker_m=context.tracker_m + 500.0), atol=1e-3)
@@ -113,7 +113,7 @@ def moved(cut: ForecastWindows, by_m: float) -> ForecastWindows:
     c = cut.context
     assert c.known_goal_m is not None and c.tracker_m is not None
     there = dataclasses.replace(c, datum_m=c.datum_m + by_m, known_goal_m=c.known_goal_m + by_m, tracker_m=c.tracker_m + by_m)
-    return dataclasses.replace(cut, context=there)
+    return cut.with_context(there)
 
 
 def test_places_are_told_as_they_should_be_and_a_network_may_do_without_a_map() -> None:
@@ -123,14 +123,14 @@ def test_places_are_told_as_they_should_be_and_a_network_may_do_without_a_map() 
         small = dataclasses.replace(SMALL, places=places, map_channels=0)  # type: ignore[arg-type]
         config = dataclasses.replace(CONFIG, network=small)
         found = model(config=config)
-        tracks[places] = [found.placed(c.context).sample(c.windows, 2).position_m for c in (cut, moved(cut, 800.0))]
-        inputs = scene_inputs(cut.windows, cut.context, config)
+        tracks[places] = [found.sample(c.windows, 2).position_m for c in (cut, moved(cut, 800.0))]
+        inputs = scene_inputs(cut.windows, config)
         is_offset, is_place = (bool(inputs.rows[..., columns].any()) for columns in (slice(4, 6), slice(2, 4)))
         assert (is_offset, is_place) == (places != "absolute", places != "relative")
     assert torch.allclose(*tracks["relative"], atol=0.5)  # without a map it does not know where it is
     assert not torch.allclose(*tracks["absolute"], atol=20.0)
     with_map = model(config=dataclasses.replace(CONFIG, network=dataclasses.replace(SMALL, places="relative")))
-    here, there = (with_map.placed(c.context).sample(c.windows, 2).position_m for c in (cut, moved(cut, 800.0)))
+    here, there = (with_map.sample(c.windows, 2).position_m for c in (cut, moved(cut, 800.0)))
     assert not torch.allclose(here, there, atol=0.5)
 
 
@@ -138,11 +138,11 @@ def test_places_are_told_as_they_should_be_and_a_network_may_do_without_a_map() 
 def test_hypotheses_belong_to_their_window(sampler: str) -> None:
     cut = windows()
     config = dataclasses.replace(CONFIG, few_steps=2 if sampler == "few" else 0)
-    found = model(SceneSampling(sampler=sampler, num_steps=3), config).placed(cut.context)  # type: ignore[arg-type]
+    found = model(SceneSampling(sampler=sampler, num_steps=3), config)  # type: ignore[arg-type]
     together = found.sample(cut.windows, 3).position_m
     assert together.shape == (8, 3, 1, 120, 2) and bool(together.isfinite().all())
     pick = torch.tensor([5, 2])
-    alone = found.placed(cut.context[pick]).sample(cut.windows[pick], 3).position_m
+    alone = found.sample(cut.windows[pick], 3).position_m
     assert torch.allclose(alone, together[pick], atol=0.5)
     step = together.diff(dim=-2).norm(dim=-1)
     assert float(step.max()) <= CONFIG.max_step_m * 1.0001
@@ -157,7 +157,7 @@ def test_nothing_is_said_of_windows_without_detections() -> None:
     rec = recordings()
     rec.is_detected[rec.offset[1] : rec.offset[2]] = False
     cut = cut_windows(rec, np.array([1, 2]), np.array([3, 29]), known_start=False)
-    found = model().placed(cut.context).sample(cut.windows, 2)
+    found = model().sample(cut.windows, 2)
     assert bool(found.position_m[0].isnan().all()) and bool(found.position_m[1].isfinite().all())
     assert found.status == (("no_detections",), ("ok",))
 
@@ -170,12 +170,13 @@ def test_guidance_and_repair_keep_out_of_obstacles(guidance: str) -> None:
     shares = {}
     for is_repaired in (False, True):
         sampling = SceneSampling(sampler="ddpm", num_steps=10, guidance=guidance, is_repaired=is_repaired)  # type: ignore[arg-type]
-        found = model(sampling, std=0.05).placed(cut.context, walls).sample(cut.windows, 4).position_m
+        walled = cut.with_context(dataclasses.replace(cut.context, obstacles=walls))
+        found = model(sampling, std=0.05).sample(walled.windows, 4).position_m
         offset = cut.context.datum_m[:, None, None, None]
         hit = states_in_collision(found, walls, offset_m=offset)
         crossing = segments_in_collision(found, walls, offset_m=offset)
         shares[is_repaired] = (float(hit.double().mean()), float(crossing.double().mean()))
-    free = model(SceneSampling(sampler="ddpm", num_steps=10), std=0.05).placed(cut.context).sample(cut.windows, 4).position_m
+    free = model(SceneSampling(sampler="ddpm", num_steps=10), std=0.05).sample(cut.windows, 4).position_m
     unguided = float(states_in_collision(free, walls, offset_m=cut.context.datum_m[:, None, None, None]).double().mean())
     assert unguided > 0.01
     if guidance in ("final", "clean"):
@@ -185,10 +186,10 @@ def test_guidance_and_repair_keep_out_of_obstacles(guidance: str) -> None:
 
 def test_reading_the_detections_again_and_rounding_change_little() -> None:
     cut = windows()
-    plain = model(SceneSampling(num_steps=3)).placed(cut.context).sample(cut.windows, 3).position_m
-    again = model(SceneSampling(num_steps=3, encode_each_step=True)).placed(cut.context).sample(cut.windows, 3).position_m
+    plain = model(SceneSampling(num_steps=3)).sample(cut.windows, 3).position_m
+    again = model(SceneSampling(num_steps=3, encode_each_step=True)).sample(cut.windows, 3).position_m
     assert torch.allclose(plain, again, atol=0.5)
-    rounded = model(SceneSampling(num_steps=3, precision="bfloat16")).placed(cut.context).sample(cut.windows, 3).position_m
+    rounded = model(SceneSampling(num_steps=3, precision="bfloat16")).sample(cut.windows, 3).position_m
     difference = (rounded - plain).norm(dim=-1)
     assert 0.0 < float(difference.mean()) < 0.2 * CONFIG.unit_step_m
 
@@ -196,14 +197,14 @@ def test_reading_the_detections_again_and_rounding_change_little() -> None:
 def test_refusals_name_what_to_do() -> None:
     cut = windows()
     with pytest.raises(ConfigError, match="step_s = 60"):
-        model().placed(cut.context).sample(dataclasses.replace(cut.windows, time_s=cut.windows.time_s * 2), 2)
+        model().sample(dataclasses.replace(cut.windows, time_s=cut.windows.time_s * 2).with_context(cut.context), 2)
     with pytest.raises(ConfigError, match="not tuned"):
-        model(SceneSampling(sampler="few")).placed(cut.context).sample(cut.windows, 2)
+        model(SceneSampling(sampler="few")).sample(cut.windows, 2)
     with pytest.raises(ConfigError, match=r"'ddim', but .* 2 steps"):
         tuned = dataclasses.replace(CONFIG, few_steps=2)
-        model(SceneSampling(sampler="ddim"), tuned).placed(cut.context).sample(cut.windows, 2)
-    with pytest.raises(ValueError, match="placed"):
-        model().sample(cut.windows, 2)
+        model(SceneSampling(sampler="ddim"), tuned).sample(cut.windows, 2)
+    with pytest.raises(ValueError, match="where they are"):
+        model().sample(cut.windows.with_context(None), 2)
     with pytest.raises(ValueError, match="ddpm"):
         SceneSampling(sampler="ddim", guidance="paper")
     with pytest.raises(ValueError, match="reach"):
@@ -265,9 +266,9 @@ def test_the_few_steps_of_training_are_those_of_sampling() -> None:
     cut, config = windows(), dataclasses.replace(CONFIG, few_steps=2)
     plain = SceneSampling(guidance="none", is_antithetic=False)
     free = dataclasses.replace(model(config=config), sampling=plain)
-    free = dataclasses.replace(free, config=dataclasses.replace(config, max_step_m=1e9)).placed(cut.context)
+    free = dataclasses.replace(free, config=dataclasses.replace(config, max_step_m=1e9))
     drawn = free.sample(cut.windows, 2).position_m[:, :, 0]
-    inputs = scene_inputs(cut.windows, cut.context, config)
+    inputs = scene_inputs(cut.windows, config)
     noise = torch.stack([torch.randn(2, 40, 2, generator=torch.Generator().manual_seed(int(s))) for s in cut.windows.seeds])
     with torch.no_grad():
         code = free.network.encode(inputs).repeat_interleave(2, dim=0)
@@ -280,14 +281,14 @@ def test_every_second_hypothesis_begins_with_mirrored_noise() -> None:
     """A network that answers nothing leaves the noise as it is, but for its length."""
     cut = windows()
     for sampler, is_mirrored in (("dpmpp", True), ("ddim", True), ("ddpm", False)):
-        silent = model(SceneSampling(sampler=sampler, num_steps=3), std=0.0).placed(cut.context)  # type: ignore[arg-type]
+        silent = model(SceneSampling(sampler=sampler, num_steps=3), std=0.0)  # type: ignore[arg-type]
         tracks = silent.sample(cut.windows, 5).position_m[:, :, 0]
         middle = 0.5 * (tracks[:, 0:4:2] + tracks[:, 1:4:2])[:, :, :40]
         spread = (tracks[:, 0:4:2] - tracks[:, 1:4:2])[:, :, :40]
         assert tracks.shape[1] == 5 and bool((spread.norm(dim=-1) > 0.1).any())
         same = middle[:, :1].expand_as(middle)  # where the last detection and nothing else leads
         assert torch.allclose(middle, same, atol=0.5) == is_mirrored, sampler
-    alone = model(SceneSampling(num_steps=3, is_antithetic=False), std=0.0).placed(cut.context)
+    alone = model(SceneSampling(num_steps=3, is_antithetic=False), std=0.0)
     tracks = alone.sample(cut.windows, 4).position_m[:, :, 0]
     assert not torch.allclose(tracks[:, 0] + tracks[:, 1], tracks[:, 2] + tracks[:, 3], atol=20.0)
 

@@ -93,12 +93,12 @@ def test_episodes_are_selected_whole_and_must_be_whole() -> None:
 
 def test_rows_of_independent_agents_are_those_that_are_there() -> None:
     cut = windows()
-    rows = agent_rows(without(cut, 1, 2), cut.context, ALONE)
+    rows = agent_rows(without(cut, 1, 2), ALONE)
     assert rows.team is None and bool(rows.is_real.all())
     assert list(zip(rows.window.tolist(), rows.agent.tolist(), strict=True)) == [
         (0, 0), (0, 1), (0, 2), (1, 0), (1, 1), (2, 0), (2, 1), (2, 2),
     ]  # fmt: skip
-    together = agent_rows(without(cut, 1, 2), cut.context, TOGETHER)
+    together = agent_rows(without(cut, 1, 2), TOGETHER)
     assert together.team is not None and together.team.is_present.tolist() == [[True] * 3, [True, True, False], [True] * 3]
     assert together.is_real.tolist() == [True] * 5 + [False] + [True] * 3
     assert bool(together.windows.is_active.all())
@@ -107,7 +107,7 @@ def test_rows_of_independent_agents_are_those_that_are_there() -> None:
 @pytest.mark.parametrize("config", [ALONE, TOGETHER])
 def test_an_absent_agent_changes_nothing_for_the_others_but_that_it_is_not_there(config: SceneConfig) -> None:
     cut, estimator = windows(), model(config)
-    drawn = estimator.placed(cut.context).sample(without(cut, 1, 2), 4)
+    drawn = estimator.sample(without(cut, 1, 2), 4)
     assert drawn.position_m.shape == (3, 4, 3, 120, 2)
     assert bool(drawn.position_m[1, :, 2].isnan().all()) and drawn.status[1] == ("ok", "ok", "no_detections")
     pair = dataclasses.replace(
@@ -115,7 +115,7 @@ def test_an_absent_agent_changes_nothing_for_the_others_but_that_it_is_not_there
     )
     assert cut.context.known_goal_m is not None
     context = dataclasses.replace(cut.context, known_goal_m=cut.context.known_goal_m[:, :2])
-    two = estimator.placed(context).sample(pair, 4)
+    two = estimator.sample(pair.with_context(context), 4)
     assert torch.allclose(two.position_m[1], drawn.position_m[1, :, :2], atol=0.05)
 
 
@@ -125,25 +125,25 @@ def test_agents_see_each_other_where_there_is_attention() -> None:
     moved[:, 2] += 1500.0
     elsewhere = dataclasses.replace(cut.windows, detections=dataclasses.replace(cut.windows.detections, position_m=moved))
     for config, sees in ((ALONE, False), (TOGETHER, True)):
-        estimator = model(config).placed(cut.context)
+        estimator = model(config)
         before, after = (estimator.sample(w, 3).position_m[:, :, :2] for w in (cut.windows, elsewhere))
         assert torch.allclose(before, after, atol=1e-3) != sees
 
 
 def test_a_windows_draws_do_not_depend_on_its_neighbours_or_chunks() -> None:
     cut, estimator = windows(), model(TOGETHER)
-    whole = estimator.placed(cut.context).sample(cut.windows, 4).position_m
+    whole = estimator.sample(cut.windows, 4).position_m
     small = dataclasses.replace(estimator, sampling=dataclasses.replace(estimator.sampling, chunk=4))
-    assert torch.allclose(small.placed(cut.context).sample(cut.windows, 4).position_m, whole, atol=0.05)
+    assert torch.allclose(small.sample(cut.windows, 4).position_m, whole, atol=0.05)
     pick = torch.tensor([2])
-    alone = estimator.placed(cut.context[pick]).sample(cut.windows[pick], 4).position_m
+    alone = estimator.sample(cut.windows[pick], 4).position_m
     assert torch.allclose(alone, whole[2:], atol=0.05)
 
 
 def test_laid_out_for_sampling_agents_see_each_other_as_in_the_network() -> None:
     cut, estimator = windows(), model(TOGETHER)
-    rows = agent_rows(without(cut, 1, 2), cut.context, TOGETHER)
-    inputs = scene_inputs(rows.windows, rows.context, TOGETHER)
+    rows = agent_rows(without(cut, 1, 2), TOGETHER)
+    inputs = scene_inputs(rows.windows, TOGETHER)
     frozen = FrozenScene(estimator.network)
     noisy = torch.randn(2 * len(inputs), TOGETHER.num_pieces, 2, generator=torch.Generator().manual_seed(0))
     twice = inputs.repeated(2)
@@ -174,7 +174,7 @@ def test_shared_detections_are_those_of_all_by_time() -> None:
 
 def test_with_shared_detections_every_agent_is_drawn() -> None:
     cut = windows()
-    drawn = model(SHARED).placed(cut.context).sample(without(cut, 1, 2), 3)
+    drawn = model(SHARED).sample(without(cut, 1, 2).with_context(cut.context), 3)
     assert bool(drawn.position_m.isfinite().all()) and drawn.status[1] == ("ok", "ok", "ok")
 
 
@@ -205,15 +205,15 @@ def test_training_windows_are_the_truth_and_absent_agents_cost_nothing(config: S
 def test_a_goal_that_is_told_goes_with_its_agent() -> None:
     cut = windows()
     goal = torch.arange(18, dtype=torch.float64).reshape(3, 3, 2)
-    rows = agent_rows(cut.windows, dataclasses.replace(cut.context, known_goal_m=goal), TOGETHER)
-    assert rows.context.known_goal_m is not None
-    assert torch.equal(rows.context.known_goal_m[:, 0], goal.reshape(9, 2))
-    assert isinstance(rows.context, Context)
+    told = cut.with_context(dataclasses.replace(cut.context, known_goal_m=goal))
+    context = agent_rows(told.windows, TOGETHER).windows.context
+    assert isinstance(context, Context) and context.known_goal_m is not None
+    assert torch.equal(context.known_goal_m[:, 0], goal.reshape(9, 2))
 
 
 def test_more_agents_than_can_attend_to_each_other_are_refused_in_a_line() -> None:
     crowd = cut_windows(recordings(num=1, agents=MAX_AGENTS + 1), np.array([0]), np.array([30]))
     with pytest.raises(ConfigError, match=f"at most {MAX_AGENTS} agents together, here are {MAX_AGENTS + 1}"):
-        model(TOGETHER).placed(crowd.context).sample(crowd.windows, 1)
-    drawn = model(ALONE).placed(crowd.context).sample(crowd.windows, 1)
+        model(TOGETHER).sample(crowd.windows, 1)
+    drawn = model(ALONE).sample(crowd.windows, 1)
     assert drawn.position_m.shape[2] == MAX_AGENTS + 1

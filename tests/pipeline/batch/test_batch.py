@@ -10,9 +10,11 @@ import pytest
 from fixtures.batch import SETTINGS, hidden_in, outcome_or_death, results_of, write_tiny_logs
 
 from cadence.errors import InputError
+from pipeline.batch.config import RunConfig
 from pipeline.batch.engines.local import run_in_processes, run_in_sequence
+from pipeline.batch.outcome import LogTask, exit_code
 from pipeline.batch.run import choose_engine, run
-from pipeline.batch.tasks import LogTask, RunConfig, exit_code, run_task, run_tasks
+from pipeline.batch.tasks import run_task, run_tasks
 from pipeline.config import stage_config
 from pipeline.locks import clear_abandoned, locked
 from pipeline.missions import find_missions

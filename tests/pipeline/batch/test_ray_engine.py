@@ -11,10 +11,12 @@ import pytest
 from fixtures.line_logs import straight_line, write_log
 
 from cadence.errors import ConfigError, DeviceError
+from pipeline.batch.config import RunConfig
 from pipeline.batch.engines import ray as module
 from pipeline.batch.engines.local import run_in_sequence
 from pipeline.batch.engines.ray import NUM_ATTEMPTS, run_on_ray
-from pipeline.batch.tasks import LogOutcome, LogTask, RunConfig, plan_tasks, run_task, run_tasks
+from pipeline.batch.outcome import LogOutcome, LogTask
+from pipeline.batch.tasks import plan_tasks, run_task, run_tasks
 from pipeline.config import stage_config
 
 pytestmark = pytest.mark.timeout(600)  # Ray takes seconds to start, and many where the machine is busy

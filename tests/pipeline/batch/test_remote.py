@@ -8,9 +8,10 @@ from fixtures.line_logs import straight_line, write_log
 
 import pipeline.batch.remote as module
 from cadence.errors import DeviceError
+from pipeline.batch.config import RunConfig
+from pipeline.batch.outcome import exit_code
 from pipeline.batch.remote import RECEIPT_NAME, SOURCE_NAME, run_anywhere
 from pipeline.batch.run import run
-from pipeline.batch.tasks import RunConfig, exit_code
 from pipeline.config import stage_config
 from pipeline.missions import find_missions
 from pipeline.progress import Progress

@@ -7,9 +7,10 @@ import pytest
 
 import pipeline.batch.tasks as module
 from cadence.errors import DeviceError, InputError, NothingDetectedError, UsageError
+from pipeline.batch.config import RunConfig
+from pipeline.batch.outcome import complaints, exit_code
 from pipeline.batch.run import run, selection_settings
 from pipeline.batch.summaries import batch_summary
-from pipeline.batch.tasks import RunConfig, complaints, exit_code
 from pipeline.config import stage_config
 from pipeline.extract.stage import ExtractConfig
 from pipeline.manifest import StageResult

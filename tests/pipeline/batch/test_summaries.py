@@ -3,8 +3,9 @@
 import json
 from pathlib import Path
 
+from pipeline.batch.config import RunConfig
+from pipeline.batch.outcome import LogOutcome, LogTask
 from pipeline.batch.summaries import batch_record, batch_summary, log_record, score_lines, stage_summary, to_json
-from pipeline.batch.tasks import LogOutcome, LogTask, RunConfig
 from pipeline.manifest import StageResult
 
 INGEST = StageResult("ingest", "done", (Path("o/a/catalogue.json"),), {"num_messages": 5, "problems": ["cut off at 10:00"]})

@@ -13,11 +13,11 @@ from fixtures.unknown_origin import CONFIG, START_NS, SWAPPED, TRUE, detections,
 
 from cadence.association.types import Associations
 from cadence.types import Detections, HypothesisSet, WindowBatch
+from pipeline import associations
 from pipeline.evaluate.joint import JOINT_METRICS, JointScorer
 from pipeline.evaluate.matching import match_to_truth, matched
 from pipeline.evaluate.scores import PARTS, score_cells
 from pipeline.evaluate.stage import EvaluateConfig, evaluate, score_mission
-from pipeline.infer import ways as association
 from pipeline.infer.stage import infer
 from pipeline.progress import Progress
 from pipeline.tables import Frame, write_table
@@ -134,8 +134,8 @@ def two_ways(time_s, position_m, covariance_m2, origins_s, config, seed, habits=
 
 
 def test_unknown_origin_is_scored_against_the_truth(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(association, "associate", two_ways)
-    monkeypatch.setattr(association, "fit_habits", lambda *_: None)
+    monkeypatch.setattr(associations, "associate", two_ways)
+    monkeypatch.setattr(associations, "fit_habits", lambda *_: None)
     directory = mission(tmp_path, detections())
     infer(directory, CONFIG, QUIET)
     write_table(truth(("ship", 0.0), ("tug", 800.0)), directory / "truth.parquet", "truth", Frame("map"))

@@ -3,9 +3,9 @@ import json
 import numpy as np
 import pytest
 
+from pipeline.catalogue import CatalogueChannel
 from pipeline.export.display import Style, agent_hue
 from pipeline.export.layouts import build_layout, build_legacy_layout
-from pipeline.ingest.stage import CatalogueChannel
 from pipeline.tables import Frame
 from schemas import channels
 

@@ -21,7 +21,7 @@ from pipeline.config import read_config
 from pipeline.episodes.recordings import RecordingsConfig, load_recordings
 from pipeline.evaluate.stage import EvaluateConfig, evaluate_any
 from pipeline.forecast import stage as forecasts
-from pipeline.forecast.forecasters import FORECAST_RIVALS, Anywhere, label_of
+from pipeline.forecast.rivals import FORECAST_RIVALS, label_of
 from pipeline.forecast.scores import EpisodeScores
 from pipeline.forecast.stage import ForecastConfig, ForecastRun, evaluate_forecasts, forecast_windows, truth_scores
 from pipeline.progress import Progress
@@ -96,8 +96,8 @@ def run_on(data: Path, cache: Path | None, config: ForecastConfig = SMALL) -> Fo
 def test_known_answers_through_the_whole_protocol(tmp_path: Path, known_start: bool) -> None:
     config = ForecastConfig(num_windows=200, num_hypotheses=3, known_start=known_start)
     run = run_on(long_folder(tmp_path), None, config)
-    exact = run.score("exact", lambda: Anywhere(Straight()), [])
-    shifted = run.score("shifted", lambda: Anywhere(Straight(70.0)), [])
+    exact = run.score("exact", lambda: Straight(), [])
+    shifted = run.score("shifted", lambda: Straight(70.0), [])
     assert exact.count.sum() == 200 and len(exact.episode) == 4
     # now, and before any episode ends
     assert exact.mean("displacement_error")[0] == pytest.approx(0.0, abs=1e-3)
@@ -119,9 +119,6 @@ class InOrder:
 
     draws_together = True
     name = "in order"
-
-    def placed(self, context: Context, obstacles: Obstacles | None = None) -> "InOrder":
-        return self
 
     def fit(self, tracks: Detections) -> "InOrder":
         return self
@@ -150,7 +147,7 @@ def test_targets_are_drawn_together_or_alone_and_scored_one_by_one(tmp_path: Pat
     together = run.score("together", InOrder, [])
     assert together.count.sum() == 60 and len(together.episode) == 3
     assert together.mean("displacement_error")[0] == pytest.approx(150.0, rel=1e-5)
-    alone = run.score("alone", lambda: Anywhere(Straight(300.0)), [])
+    alone = run.score("alone", lambda: Straight(300.0), [])
     assert alone.mean("displacement_error")[0] == pytest.approx(300.0, rel=1e-5)
     assert truth_scores(episodes, windows).mean("ade").tolist() == [0.0] * 5
 
@@ -170,15 +167,11 @@ def test_obstacles_are_told_and_differ_by_episode(tmp_path: Path) -> None:
     run = run_on(long_folder(tmp_path), None)
     walls = [Obstacles(torch.tensor([[5000.0, 0.0, radius]], dtype=torch.float64)) for radius in (1.0, 2.0)]
     episodes = dataclasses.replace(run.episodes, obstacles=tuple(walls[index % 2] for index in range(4)))
-    told: list[tuple[object, set[int]]] = []
+    told: list[tuple[Obstacles, set[int]]] = []
 
     class Careful(Straight):
-        def placed(self, context: Context, obstacles: Obstacles | None = None) -> "Careful":
-            self.wall = obstacles
-            return self
-
         def sample(self, windows: WindowBatch, num_hypotheses: int) -> HypothesisSet:
-            told.append((self.wall, set((windows.seeds // 10_007).tolist())))
+            told.append((windows.required_context(self.name).obstacles, set((windows.seeds // 10_007).tolist())))
             return super().sample(windows, num_hypotheses)
 
     both = dataclasses.replace(run, episodes=episodes)
@@ -187,7 +180,7 @@ def test_obstacles_are_told_and_differ_by_episode(tmp_path: Path) -> None:
     assert np.array_equal(found.sums, run.score("careful", Careful, []).sums)
     told.clear()
     dataclasses.replace(both, tells_obstacles=False).score("careful", Careful, [])
-    assert {wall for wall, _ in told} == {None}
+    assert [wall.count for wall, _ in told] == [0] * len(told)
 
 
 def test_a_killed_evaluation_goes_on_where_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -195,12 +188,12 @@ def test_a_killed_evaluation_goes_on_where_it_was(tmp_path: Path, monkeypatch: p
     cache = tmp_path / "kept"
     run = run_on(long_folder(tmp_path), cache)
     estimator = Straight(5.0)
-    whole = run.score("straight", lambda: Anywhere(estimator), ["version 1"])
+    whole = run.score("straight", lambda: estimator, ["version 1"])
     kept = sorted(cache.glob("*.json"))
     assert len(kept) == 4 and estimator.num_calls == 4
     kept[1].unlink()
     kept[2].write_text(kept[2].read_text()[:100])  # half a file
-    again = run.score("straight", lambda: Anywhere(estimator), ["version 1"])
+    again = run.score("straight", lambda: estimator, ["version 1"])
     assert estimator.num_calls == 6
     assert np.array_equal(again.sums, whole.sums) and np.array_equal(again.steps, whole.steps)
 
@@ -265,7 +258,7 @@ def test_an_estimator_without_an_answer_is_an_error_and_not_a_score(tmp_path: Pa
             return HypothesisSet(torch.full_like(found.position_m, torch.nan), found.weight, found.status)
 
     with pytest.raises(ConfigError, match="straight: no position for 30 of 30 windows"):
-        run_on(long_folder(tmp_path), None).score("silent", lambda: Anywhere(Silent()), [])
+        run_on(long_folder(tmp_path), None).score("silent", lambda: Silent(), [])
 
 
 @pytest.mark.parametrize("name", FORECAST_RIVALS)

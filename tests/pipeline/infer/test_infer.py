@@ -11,13 +11,20 @@ import pytest
 import torch
 
 from cadence.constraints.checker import segments_in_collision, states_in_collision
+from cadence.diffusion.feasible import GuidanceConfig
+from cadence.diffusion.scene import SceneSampling
 from cadence.errors import CadenceError, ConfigError, DeviceError, InputError
 from cadence.network.residual import ResidualNetwork, ResidualNetworkConfig
 from pipeline.checkpoints import CheckpointInfo, checkpoint_hash, save_checkpoint
 from pipeline.config import config_as_dict
-from pipeline.extract.obstacle_sources import read_obstacles
-from pipeline.infer.stage import GuidanceConfig, InferConfig, draw_hypotheses, fitted_model, infer
+from pipeline.estimators.fitting import FittingData
+from pipeline.estimators.presets import load_estimator
+from pipeline.estimators.samplings import GeneralSampling, Samplings
+from pipeline.infer.config import InferConfig
+from pipeline.infer.draws import draw_windows
+from pipeline.infer.stage import infer
 from pipeline.manifest import StageResult, read_manifest
+from pipeline.obstacle_file import read_obstacles
 from pipeline.progress import Progress
 from pipeline.tables import Frame, read_table, write_table
 from pipeline.windows import GridConfig, build_windows, plan_grid
@@ -176,18 +183,16 @@ def test_the_gate_is_in_the_summary(tmp_path: Path) -> None:
 
 
 def drawn(table: pa.Table, weights: Path) -> torch.Tensor:
-    config = dataclasses.replace(CONFIG, checkpoint=str(weights), is_gated=False)
-    grid = plan_grid(table, config.grid)
+    loaded = load_estimator(str(weights), Samplings(general=GeneralSampling(is_gated=False)))
+    grid = plan_grid(table, loaded.grid(GRID))
     windows = build_windows(table, grid, 5)
-    model = fitted_model(config, table, grid, windows, weights)
-    nothing = read_obstacles(weights.with_name("none.json"))
-    parts = [positions for _, positions, _, _ in draw_hypotheses(model, windows, config, nothing)]
+    estimator = loaded.fitted(FittingData.of(table, grid, windows)).estimator
+    parts = [positions for _, positions, _, _ in draw_windows(estimator, windows, CONFIG.num_hypotheses, loaded.is_apart)]
     return torch.cat(parts) + torch.from_numpy(windows.datum_m)[:, None, None, None]
 
 
 def test_elsewhere_and_at_another_time_the_same_happens(tmp_path: Path) -> None:
     weights = checkpoint(tmp_path)
-    (tmp_path / "none.json").write_text('{"version": 1, "obstacles": []}')
     here = drawn(detections(), weights)
     later = drawn(detections(shift_ns=86_400_000_000_123), weights)
     torch.testing.assert_close(later, here, atol=1e-4, rtol=0, equal_nan=True)
@@ -286,6 +291,24 @@ def test_devices_and_inputs_that_are_not_there(tmp_path: Path) -> None:
     assert isinstance(refused(directory), InputError)
     empty = mission(tmp_path / "empty", DETECTIONS.empty_table())
     assert isinstance(refused(empty), InputError)
+
+
+def test_settings_that_the_preset_does_not_read_are_refused(tmp_path: Path) -> None:
+    """They would change nothing, and nobody would notice."""
+    directory = mission(tmp_path)
+    for changes, setting in (
+        ({"checkpoint": "prison", "num_steps": 6}, "infer.num_steps"),
+        ({"checkpoint": "prison", "grid": GridConfig(step_s=5.0)}, "infer.grid.step_s"),
+        ({"checkpoint": "none", "sampler": "ddim"}, "infer.sampler"),
+        ({"checkpoint": "none", "scene": SceneSampling(num_steps=3)}, "infer.scene.num_steps"),
+    ):
+        config = dataclasses.replace(InferConfig(), **changes)
+        with pytest.raises(ConfigError, match=f"^{setting}: .* does not read it.* Read are: ") as caught:
+            infer(directory, config, QUIET)
+        assert caught.value.exit_code == 4 and "\n" not in str(caught.value)
+    for checkpoint_name, changes in (("none", {"num_steps": None}), ("none", {"grid": GridConfig(stride_steps=32)})):
+        config = dataclasses.replace(CONFIG, checkpoint=checkpoint_name, **changes)
+        assert infer(directory, config, QUIET).status == "done"
 
 
 def test_settings_that_mean_nothing() -> None:

@@ -22,15 +22,17 @@ from fixtures.unknown_origin import (
 )
 
 from cadence.association.types import AssociationConfig, Associations
+from cadence.constraints.obstacles import Obstacles
 from cadence.diffusion.absolute import AbsoluteSampling
 from cadence.errors import InputError
-from cadence.types import HypothesisSet, WindowBatch
+from cadence.types import Detections, HypothesisSet, WindowBatch
+from pipeline import associations
+from pipeline.associations import Association, WayWindows, build_way_windows, shared_out, tell_sources
 from pipeline.export.messages import read_hypotheses
 from pipeline.export.stage import ExportConfig, export
-from pipeline.infer import ways as association
+from pipeline.infer.config import InferConfig
 from pipeline.infer.draws import draw_ways
-from pipeline.infer.stage import InferConfig, infer
-from pipeline.infer.ways import Association, WayWindows, build_way_windows, shared_out, tell_sources
+from pipeline.infer.stage import infer
 from pipeline.logs.reader import open_log
 from pipeline.progress import Progress
 from pipeline.report.stage import ReportConfig, report
@@ -51,8 +53,8 @@ def three_ways(time_s, position_m, covariance_m2, origins_s, config, seed, habit
 
 @pytest.fixture
 def stand_in(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(association, "associate", three_ways)
-    monkeypatch.setattr(association, "fit_habits", lambda *_: None)
+    monkeypatch.setattr(associations, "associate", three_ways)
+    monkeypatch.setattr(associations, "fit_habits", lambda *_: None)
 
 
 def ways_of(table: pa.Table, num_hypotheses: int = 8) -> WayWindows:
@@ -93,15 +95,26 @@ def test_every_way_is_a_window_for_estimators_of_several_agents() -> None:
     assert windows.batch.detections.count[3:].tolist() == [[4, 4], [3, 5], [4, 3]]
     assert len(set(windows.batch.seeds.tolist())) == 6
 
-    def sample(batch: WindowBatch, number: np.ndarray, size: int) -> HypothesisSet:
-        """Every agent stands at its number of detections; x is the window's number."""
-        position = torch.zeros(batch.num_windows, size, 2, batch.num_steps, 2)
-        position[..., 0] = torch.from_numpy(number)[:, None, None, None]
-        position[..., 1] = batch.detections.count[:, None, :, None]
-        weight = torch.full((batch.num_windows, size), 1.0 / size)
-        return HypothesisSet(position, weight, (("ok", "ok"),) * batch.num_windows)
+    class Counting:
+        """Every agent stands at its number of detections; x is the time since the mission began."""
 
-    ((part, position, weight, status),) = draw_ways(ways, 8, sample)
+        name = "counting"
+
+        def fit(self, tracks: Detections) -> "Counting":
+            return self
+
+        def sample(self, batch: WindowBatch, size: int) -> HypothesisSet:
+            elapsed_s = batch.required_context(self.name).elapsed_s
+            assert elapsed_s is not None
+            position = torch.zeros(batch.num_windows, size, 2, batch.num_steps, 2)
+            position[..., 0] = elapsed_s[:, None, None, None]
+            position[..., 1] = batch.detections.count[:, None, :, None]
+            weight = torch.full((batch.num_windows, size), 1.0 / size)
+            return HypothesisSet(position, weight, (("ok", "ok"),) * batch.num_windows)
+
+    start_ns = int(ways.windows.origins_ns[1]) - 10**9
+    located = ways.located(start_ns, Obstacles.none())
+    ((part, position, weight, status),) = draw_ways(Counting(), located, 8)
     assert part.tolist() == [0, 1] and status == [["ok", "ok"], ["ok", "ok"]]
     torch.testing.assert_close(weight, torch.full((2, 8), 0.125, dtype=torch.float64))
     assert position[1, :, 0, 0, 0].tolist() == [1.0] * 8
@@ -149,8 +162,8 @@ def test_an_agent_may_be_missing_from_a_hypothesis(tmp_path: Path, monkeypatch: 
         label = np.stack([TRUE, np.where(TRUE == 1, -1, 0)])
         return [Associations(label[:, : int((time_s <= o).sum())], np.array([0.75, 0.25]), 3) for o in origins_s]
 
-    monkeypatch.setattr(association, "associate", associate)
-    monkeypatch.setattr(association, "fit_habits", lambda *_: None)
+    monkeypatch.setattr(associations, "associate", associate)
+    monkeypatch.setattr(associations, "fit_habits", lambda *_: None)
     directory = mission(tmp_path, detections())
     infer(directory, CONFIG, QUIET)
     for window in read_hypothesis_tables(directory).windows:
@@ -181,8 +194,8 @@ def test_all_of_it_clutter_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     def associate(time_s, position_m, covariance_m2, origins_s, config, seed, habits=None) -> list[Associations]:
         return [Associations(np.full((1, int((time_s <= o).sum())), -1), np.ones(1), 0) for o in origins_s]
 
-    monkeypatch.setattr(association, "associate", associate)
-    monkeypatch.setattr(association, "fit_habits", lambda *_: None)
+    monkeypatch.setattr(associations, "associate", associate)
+    monkeypatch.setattr(associations, "fit_habits", lambda *_: None)
     with pytest.raises(InputError, match="clutter_share"):
         infer(mission(tmp_path, detections()), CONFIG, QUIET)
 
@@ -213,8 +226,8 @@ def test_side_file_and_page_tell_of_agents_and_sources(tmp_path: Path, monkeypat
         label = np.stack([true, np.where(np.arange(len(true)) % 5 == 0, -1, true), np.where(true == 1, -1, true)])
         return [Associations(label[:, : int((time_s <= o).sum())], np.array([0.5, 0.25, 0.25]), 2) for o in origins_s]
 
-    monkeypatch.setattr(association, "associate", associate)
-    monkeypatch.setattr(association, "fit_habits", lambda *_: None)
+    monkeypatch.setattr(associations, "associate", associate)
+    monkeypatch.setattr(associations, "fit_habits", lambda *_: None)
     infer(directory, CONFIG, QUIET)
     written = read_hypothesis_tables(directory)
     export(directory, ExportConfig(), QUIET)
@@ -258,8 +271,9 @@ def slow(table: pa.Table) -> pa.Table:
 def test_presets_that_know_a_place_draw_every_way(tmp_path: Path, preset: str) -> None:
     directory = mission(tmp_path, slow(detections()))
     weights = "prison" if preset == "scene" else str(checkpoint(tmp_path / "small.safetensors"))
-    few = AbsoluteSampling(sampler="dpmpp", num_steps=2)
-    config = InferConfig(num_hypotheses=8, checkpoint=weights, device="cpu", paper=few, grid=GridConfig(stride_steps=32))
+    config = InferConfig(num_hypotheses=8, checkpoint=weights, device="cpu", grid=GridConfig(stride_steps=32))
+    if preset == "paper":
+        config = dataclasses.replace(config, paper=AbsoluteSampling(sampler="dpmpp", num_steps=2))
     result = infer(directory, config, QUIET)
     assert result.summary["preset"] == preset and result.summary["association"]["num_agents"] == 2
     for window in read_hypothesis_tables(directory).windows:

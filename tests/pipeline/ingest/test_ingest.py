@@ -7,10 +7,12 @@ from fixtures.recorder import NUM_MESSAGES, START_NS, STEP_NS, recording
 from mcap.writer import Writer
 
 from cadence.errors import InputError
+from pipeline.catalogue import open_catalogued_log, read_catalogue
 from pipeline.extract.stage import ExtractConfig, extract
-from pipeline.ingest.stage import CATALOGUE_NAME, IngestConfig, ingest, open_catalogued_log, read_catalogue
+from pipeline.ingest.stage import IngestConfig, ingest
 from pipeline.logs.reader import open_log
 from pipeline.manifest import hash_file
+from pipeline.missions import CATALOGUE_NAME
 from pipeline.progress import Progress
 
 QUIET = Progress(quiet=True)

@@ -133,7 +133,7 @@ def test_what_a_log_names_itself_stays_text(mission: Path) -> None:
     }
     rewrite(mission, "catalogue.json", json.dumps(catalogue))
     (mission / "obstacles.json").write_text(
-        json.dumps({"obstacles": [{"kind": "circle", "x_m": 1, "y_m": 2, "radius_m": 3, "name": HOSTILE[0]}]})
+        json.dumps({"version": 1, "obstacles": [{"kind": "circle", "x_m": 1, "y_m": 2, "radius_m": 3, "name": HOSTILE[0]}]})
     )
     (mission / "extract.manifest.json").write_text(
         json.dumps(

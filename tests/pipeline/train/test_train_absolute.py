@@ -8,6 +8,7 @@ import pytest
 import torch
 from fixtures.killed_training import Killed, Killer
 
+from cadence.constraints.obstacles import Obstacles
 from cadence.diffusion.absolute import AbsoluteConfig, AbsoluteSampling
 from cadence.errors import ConfigError, InputError
 from cadence.network.trajectory import TrajectoryNetwork, TrajectoryNetworkConfig
@@ -19,14 +20,15 @@ from pipeline.checkpoints import CheckpointInfo, read_info, save_checkpoint
 from pipeline.config import config_as_dict, read_config
 from pipeline.episodes.pool import EpisodeSource
 from pipeline.episodes.recordings import RecordingsConfig, save_recordings
-from pipeline.estimators.paper import absolute_grid, load_absolute, placed
+from pipeline.estimators.paper import absolute_grid, load_absolute
+from pipeline.estimators.presets import load_forecaster
 from pipeline.extract.stage import ExtractConfig
-from pipeline.forecast.forecasters import load_forecaster
 from pipeline.progress import Progress
 from pipeline.simulate.stage import SimulateConfig, simulate
+from pipeline.train.config import AbsoluteTraining, TrainConfig
 from pipeline.train.missions import mission_of_episode, missions_of_logs
-from pipeline.train.paper import AbsoluteTraining, draw_windows, mission_windows
-from pipeline.train.stage import TrainConfig, train
+from pipeline.train.paper import draw_windows, mission_windows
+from pipeline.train.stage import train
 from pipeline.windows import build_windows, plan_grid
 
 QUIET = Progress(quiet=True)
@@ -112,7 +114,7 @@ def test_a_checkpoint_samples_the_grid_it_asks_for(episode, tmp_path):
     grid = plan_grid(mission.detections, absolute_grid(model.config, 8))
     windows = build_windows(mission.detections, grid, 0)
     assert int(windows.batch.detections.count[-1, 0]) > 1  # from before the only step of history
-    found = placed(model, windows).sample(windows.batch, 3)
+    found = model.sample(windows.located(0, Obstacles.none()).batch, 3)
     assert found.position_m.shape == (windows.batch.num_windows, 3, 1, 16, 2)
     save_checkpoint(weights, network, CheckpointInfo("general", config_as_dict(MODEL)))
     with pytest.raises(ConfigError, match="preset 'general'"):
@@ -181,15 +183,15 @@ def test_training_from_episodes_goes_on_where_it_was_and_forecasts(of_episodes, 
     first = [recordings(seed).select(slice(0, 5)).position_m for seed in (0, 1)]  # the last episode of each is for validation
     assert model.config.scale_m == pytest.approx(1.02 * max(np.ptp(np.concatenate(first), axis=0)) / 2)
     cut = cut_windows(recordings(2), np.array([0, 1]), np.array([10, 5]))
-    found = model.placed(cut.context).sample(cut.windows, 2).position_m
+    found = model.sample(cut.windows, 2).position_m
     assert found.shape == (2, 2, 1, 120, 2) and bool(found.isfinite().all())
     nobody = dataclasses.replace(cut.context, known_goal_m=torch.full((2, 1, 2), torch.nan))
-    assert load_forecaster(str(whole.outputs[0])).placed(nobody, None).config.optional_goal
-    hidden = model.placed(nobody).sample(cut.windows, 2).position_m
+    assert load_forecaster(str(whole.outputs[0])).config.optional_goal
+    hidden = model.sample(cut.windows.with_context(nobody), 2).position_m
     assert bool(hidden.isfinite().all()) and not torch.allclose(hidden, found, atol=0.01)
     strict = dataclasses.replace(model, config=dataclasses.replace(model.config, optional_goal=False))
     with pytest.raises(ConfigError, match="goal"):
-        strict.placed(nobody).sample(cut.windows, 2)
+        strict.sample(cut.windows.with_context(nobody), 2)
 
 
 def test_episodes_that_do_not_fit(of_episodes, tmp_path):

@@ -18,12 +18,14 @@ from cadence.training.synthetic import SyntheticConfig
 from cadence.worlds.patrol import PatrolConfig
 from pipeline.checkpoints import read_info
 from pipeline.config import config_as_dict
-from pipeline.infer.stage import InferConfig, load_model
+from pipeline.estimators.general import load_general
+from pipeline.estimators.samplings import Samplings
 from pipeline.progress import Progress
 from pipeline.simulate.stage import SimulateConfig, simulate
 from pipeline.train import general as train_general
 from pipeline.train import shards
-from pipeline.train.stage import TrainConfig, train
+from pipeline.train.config import TrainConfig
+from pipeline.train.stage import train
 
 QUIET = Progress(quiet=True)
 NETWORK = ResidualNetworkConfig(width=8, multipliers=(1, 2), encoder_size=8, level_size=8)
@@ -63,7 +65,7 @@ def test_a_training_leaves_a_checkpoint_and_its_curve(whole: Path) -> None:
     info = read_info(whole / "checkpoint.safetensors")
     assert info.preset == "general" and info.network == config_as_dict(NETWORK) and info.training["steps"] == 5
     assert info.scores["validation_loss"] == float(curve(whole)[-1][2])
-    model = load_model(InferConfig(device="cpu"), whole / "checkpoint.safetensors")
+    model = load_general(whole / "checkpoint.safetensors", Samplings(device="cpu")).estimator
     assert model.network is not None and model.network.config == NETWORK
     assert not any(path.name.endswith(".part") for path in whole.rglob("*"))
 

@@ -17,9 +17,11 @@ from cadence.training.loop import OptimiserConfig
 from pipeline.checkpoints import read_info
 from pipeline.config import read_config
 from pipeline.episodes.recordings import RecordingsConfig, save_recordings
+from pipeline.estimators.mixtures import load_rival
 from pipeline.progress import Progress
-from pipeline.train.rivals import RivalTraining, load_rival, train_rival
-from pipeline.train.stage import TrainConfig, train
+from pipeline.train.config import RivalTraining, TrainConfig
+from pipeline.train.rivals import train_rival
+from pipeline.train.stage import train
 
 QUIET = Progress(quiet=True)
 HISTORY = HistoryConfig(max_detections=12, tracker_steps=4)
@@ -104,7 +106,7 @@ def test_grammi_goes_on_from_the_model_without_mutual_information(tmp_path):
     tuned, plain = load_rival(result.outputs[0]), load_rival(first)
     rec = recordings(2)
     found = cut_windows(rec, *choose_windows(rec, 8, np.random.default_rng(0)), num_tracker_steps=4)
-    a, b = (model.placed(found.context).mixture(found.windows) for model in (tuned, plain))
+    a, b = (model.mixture(found.windows) for model in (tuned, plain))
     distance = (a.mean() - b.mean()).norm(dim=-1).mean()
     assert 0 < distance < 50, "fine-tuning by three small steps must change the answer, and not much"
 
@@ -120,7 +122,7 @@ def test_one_trunk_becomes_one_for_each_horizon(tmp_path):
     assert len(network.trunks) == len(network.horizons) > len(shared.trunks) == 1
     rec = recordings(2)
     found = cut_windows(rec, *choose_windows(rec, 8, np.random.default_rng(0)), num_tracker_steps=4)
-    a, b = (load_rival(path).placed(found.context).mixture(found.windows) for path in (widened, first))
+    a, b = (load_rival(path).mixture(found.windows) for path in (widened, first))
     torch.testing.assert_close(a.mean_m, b.mean_m)
     assert (read_info(first).training["windows"], read_info(widened).training["windows"]) == (6 * 16, 7 * 16)
     with pytest.raises(ConfigError, match="not the same network"):  # trunks apart do not become one again
@@ -171,7 +173,7 @@ def test_checkpoints_of_other_presets_are_refused(tmp_path):
     assert load_rival(path, uses_goal=True).uses_goal
     text = path.with_suffix(".json").read_text().replace('"vrnn"', '"general"')
     path.with_suffix(".json").write_text(text)
-    with pytest.raises(ConfigError, match="expected one of vrnn"):
+    with pytest.raises(ConfigError, match="expected one of the preset 'vrnn' or"):
         load_rival(path)
 
 

@@ -10,6 +10,7 @@ import pytest
 import torch
 from fixtures.killed_training import Killed, Killer
 
+from cadence.diffusion.feasible import GuidanceConfig
 from cadence.diffusion.scene import SceneSampling
 from cadence.diffusion.scene_frame import SceneConfig
 from cadence.errors import ConfigError, InputError
@@ -21,11 +22,12 @@ from pipeline.episodes.pool import EpisodeSource
 from pipeline.episodes.recordings import RecordingsConfig, save_recordings
 from pipeline.estimators.scene import load_scene
 from pipeline.evaluate.stage import EvaluateConfig, evaluate
-from pipeline.infer.stage import GuidanceConfig, InferConfig, infer
+from pipeline.infer.config import InferConfig
+from pipeline.infer.stage import infer
 from pipeline.progress import Progress
 from pipeline.tables import Frame, read_table, write_table
-from pipeline.train.scene import SceneTraining
-from pipeline.train.stage import TrainConfig, train
+from pipeline.train.config import SceneTraining, TrainConfig
+from pipeline.train.stage import train
 from schemas.tables import DETECTIONS, TRUTH
 
 QUIET = Progress(quiet=True)
@@ -87,7 +89,7 @@ def test_energy_tunes_a_trained_network_for_few_steps(sources, tmp_path):
     model = load_scene(tuned.outputs[0])
     assert model.config.few_steps == 3 and read_info(tuned.outputs[0]).preset == "scene"
     cut = cut_windows(recordings(3), np.array([0, 1]), np.array([10, 5]))
-    assert bool(model.placed(cut.context).sample(cut.windows, 2).position_m.isfinite().all())
+    assert bool(model.sample(cut.windows, 2).position_m.isfinite().all())
     with pytest.raises(ValueError, match="start"):
         config(sources, objective="energy")
 

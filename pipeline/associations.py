@@ -19,6 +19,7 @@ from cadence.association.fitting import fit_habits
 from cadence.association.particles import Stream
 from cadence.association.presence import Habits
 from cadence.association.types import CLUTTER, AssociationConfig, Associations, agent_probability
+from cadence.constraints.obstacles import Obstacles
 from cadence.errors import InputError
 from cadence.resampling import systematic
 from cadence.types import Detections, WindowBatch
@@ -223,6 +224,10 @@ class WayWindows:
     _readings: tuple[_Reading, ...]
     _pool: DetectionTrack
 
+    def located(self, start_ns: int, obstacles: Obstacles) -> "WayWindows":
+        """See `MissionWindows.located`."""
+        return replace(self, windows=self.windows.located(start_ns, obstacles))
+
     def tracks(self, part: slice) -> tuple[MissionWindows, torch.Tensor]:
         """Some windows [b] whose columns are all different tracks, and the column of each hypothesis and agent [b, K, A].
 
@@ -267,9 +272,9 @@ class WayWindows:
         whole = self.windows
         datum_m, origins_ns = whole.datum_m[window], whole.origins_ns[window]
         detections = _padded(self._pool, index, len(names), origins_ns, datum_m)
-        batch = WindowBatch(
-            whole.batch.time_s, detections, whole.batch.seeds[torch.from_numpy(window)], whole.batch.origin_index
-        )
+        pick = torch.from_numpy(window)
+        context = None if whole.batch.context is None else whole.batch.context[pick]
+        batch = WindowBatch(whole.batch.time_s, detections, whole.batch.seeds[pick], whole.batch.origin_index, context)
         return MissionWindows(batch, origins_ns, whole.step_ns, names, datum_m)
 
 

@@ -1,0 +1,111 @@
+"""The presets: every kind of checkpoint, how it becomes an estimator, and which settings it reads.
+
+A new preset is a module beside this one and an entry in PRESETS.
+"""
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from cadence.errors import ConfigError
+from cadence.types import Estimator
+from pipeline.checkpoints import find_checkpoint, read_info
+from pipeline.config import changed_settings
+from pipeline.estimators.general import load_general
+from pipeline.estimators.loaded import Loaded
+from pipeline.estimators.mixtures import RIVALS, load_mixture
+from pipeline.estimators.paper import load_paper
+from pipeline.estimators.samplings import Samplings
+from pipeline.estimators.scene import load_place
+
+NO_CHECKPOINT = "none"
+"""Stands for the bank alone where a checkpoint is named."""
+
+
+@dataclass(frozen=True)
+class Preset:
+    """One kind of checkpoint.
+
+    load       weights and settings → what the stages use
+    reads      settings of [infer] that it reads, beside those that every preset does (`READ_BY_ALL`); a name with a full stop
+               at its end stands for the whole table
+    infers     it draws hypotheses of a recorded mission
+    forecasts  it forecasts by the paper's protocol, without being fitted to a log
+    """
+
+    load: Callable[[Path, Samplings], Loaded]
+    reads: tuple[str, ...] = ()
+    infers: bool = True
+    forecasts: bool = True
+
+
+READ_BY_ALL = (
+    "checkpoint", "num_hypotheses", "seed", "device", "default_sigma_m", "is_associated", "association.", "grid.stride_steps",
+)  # fmt: skip
+"""Settings of [infer] that act whatever the preset."""
+
+_BANK = ("grid.", "guidance.")
+
+PRESETS: Mapping[str, Preset] = {
+    "general": Preset(load_general, ("sampler", "num_steps", "is_gated", *_BANK), forecasts=False),
+    "scene": Preset(load_place, ("scene.", "guidance.")),
+    "paper": Preset(load_paper, ("paper.",)),
+    **dict.fromkeys(RIVALS, Preset(load_mixture, infers=False)),
+}
+
+
+def find_weights(checkpoint: str) -> Path | None:
+    """The file that a checkpoint's name stands for; None for the bank alone. `ConfigError` where there is none."""
+    return None if checkpoint == NO_CHECKPOINT else find_checkpoint(checkpoint)
+
+
+def load_estimator(checkpoint: str, samplings: Samplings) -> Loaded:
+    """What infer draws with. `ConfigError` for checkpoints that cannot be read or do not infer."""
+    weights = find_weights(checkpoint)
+    if weights is None:
+        return load_general(None, samplings)
+    return _preset(weights, "draw hypotheses of missions", lambda preset: preset.infers).load(weights, samplings)
+
+
+def load_forecaster(checkpoint: str, samplings: Samplings | None = None) -> Estimator:
+    """The estimator that the paper's protocol scores. `ConfigError` for checkpoints that cannot be read or do not forecast."""
+    weights = find_checkpoint(checkpoint)
+    preset = _preset(weights, "forecast", lambda preset: preset.forecasts)
+    return preset.load(weights, samplings or Samplings()).estimator
+
+
+def refuse_unread(checkpoint: str, config: object) -> None:
+    """`ConfigError` where a setting of [infer] differs from its default and the checkpoint's preset does not read it.
+
+    Checkpoints of presets that do not infer pass: loading them says more.
+    """
+    weights = find_weights(checkpoint)
+    name = "bank" if weights is None else read_info(weights).preset
+    if name != "bank" and name not in PRESETS:
+        return
+    reads = _BANK if name == "bank" else PRESETS[name].reads
+    unread = _unread(changed_settings(config), (*READ_BY_ALL, *reads))
+    if unread:
+        known = ", ".join(f"infer.{setting.removesuffix('.')}" for setting in (*reads, *READ_BY_ALL))
+        raise ConfigError(
+            f"infer.{unread[0]}: checkpoint {checkpoint!r} (preset {name}) does not read it, so it would change nothing; "
+            f"leave it out. Read are: {known}"
+        )
+
+
+def _unread(settings: Iterable[str], reads: Iterable[str]) -> list[str]:
+    known = tuple(reads)
+    return [
+        setting
+        for setting in settings
+        if not any(setting == name or (name.endswith(".") and setting.startswith(name)) for name in known)
+    ]
+
+
+def _preset(weights: Path, purpose: str, serves: Callable[[Preset], bool]) -> Preset:
+    name = read_info(weights).preset
+    preset = PRESETS.get(name)
+    if preset is None or not serves(preset):
+        able = ", ".join(known for known, preset in PRESETS.items() if serves(preset))
+        raise ConfigError(f"{weights}: a checkpoint of the preset {name!r}, which does not {purpose}; give one of {able}")
+    return preset

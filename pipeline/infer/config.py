@@ -1,0 +1,59 @@
+"""The settings of the infer stage."""
+
+from dataclasses import dataclass, field
+
+from cadence.association.types import AssociationConfig
+from cadence.diffusion.absolute import AbsoluteSampling
+from cadence.diffusion.feasible import GuidanceConfig
+from cadence.diffusion.general import SamplerName
+from cadence.diffusion.scene import SceneSampling
+from pipeline.checkpoints import DEFAULT
+from pipeline.estimators.samplings import GeneralSampling, Samplings
+from pipeline.windows import GridConfig
+
+
+@dataclass(frozen=True)
+class InferConfig:
+    """How hypotheses are drawn. What the preset of the checkpoint does not read is refused unless it is left at its default.
+
+    num_hypotheses   for each window
+    seed             of all random numbers
+    checkpoint       a .safetensors file, the name of a shipped one, or "none" for the bank alone
+    sampler          of the general preset: "rotation" (by default), "ddim" or "dpmpp"
+    num_steps        of the general preset: evaluations of the network a hypothesis; 6 by default
+    default_sigma_m  accuracy of detections that state none
+    device           "auto", "cpu" or "cuda"
+    paper            how a checkpoint of the paper preset is sampled; it brings its own grid
+    scene            how a checkpoint of the scene preset is sampled; it brings its own grid
+    is_gated         of the general preset: the network moves all, half or none of the hypotheses, as withheld detections of
+                     this log advise
+    is_associated    detections of unknown origin are told apart; otherwise they are taken for one agent called "unknown"
+    association      how they are told apart
+    """
+
+    num_hypotheses: int = 30
+    seed: int = 0
+    checkpoint: str = DEFAULT
+    sampler: SamplerName | None = None
+    num_steps: int | None = None
+    default_sigma_m: float = 0.0
+    device: str = "auto"
+    is_gated: bool = True
+    is_associated: bool = True
+    association: AssociationConfig = field(default_factory=AssociationConfig)
+    grid: GridConfig = field(default_factory=GridConfig)
+    guidance: GuidanceConfig = field(default_factory=GuidanceConfig)
+    paper: AbsoluteSampling = field(default_factory=AbsoluteSampling)
+    scene: SceneSampling = field(default_factory=SceneSampling)
+
+    def __post_init__(self) -> None:
+        is_few = self.num_hypotheses < 1 or (self.num_steps is not None and self.num_steps < 1)
+        if is_few or self.default_sigma_m < 0:
+            raise ValueError("num_hypotheses and num_steps must be at least 1, default_sigma_m not negative")
+
+    @property
+    def samplings(self) -> Samplings:
+        """What checkpoints are loaded with."""
+        default = GeneralSampling()
+        general = GeneralSampling(self.sampler or default.sampler, self.num_steps or default.num_steps, self.is_gated)
+        return Samplings(general, self.paper, self.scene, self.guidance, self.device)
