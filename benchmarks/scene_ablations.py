@@ -28,6 +28,7 @@ from cadence.metrics import Interval
 from cadence.network.scene import SceneNetwork
 from cadence.recordings import Recordings
 from cadence.training.loop import OptimiserConfig
+from cadence.training.place import untrained_network
 from cadence.worlds.prison_map import SIDE, prison_map
 from pipeline.checkpoints import checkpoint_hash, read_info
 from pipeline.episodes.pool import EpisodePool, EpisodeSource
@@ -40,7 +41,7 @@ from pipeline.forecast.tables import comparison, line, mean_interval, number, wi
 from pipeline.manifest import write_atomic
 from pipeline.progress import Progress
 from pipeline.train.config import SceneTraining, TrainConfig
-from pipeline.train.scene import train_scene_network, untrained_network
+from pipeline.train.scene import train_scene_network
 
 SETS = ("low", "med", "high")
 KINDS = ("simulated", "original")

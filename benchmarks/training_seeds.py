@@ -26,6 +26,7 @@ from table1_page import LATE, MINUTES, NAMES, measure_cells, worst
 
 from cadence.errors import CadenceError
 from cadence.recordings import Recordings
+from cadence.training.place import untrained_network
 from pipeline.checkpoints import checkpoint_hash, read_info, windows_seen
 from pipeline.config import stage_config
 from pipeline.episodes.pool import EpisodePool, EpisodeSource
@@ -40,7 +41,7 @@ from pipeline.manifest import write_atomic
 from pipeline.progress import Progress
 from pipeline.train.config import TrainConfig
 from pipeline.train.rivals import train_rival
-from pipeline.train.scene import train_scene_network, untrained_network
+from pipeline.train.scene import train_scene_network
 
 World = Literal["prison", "narco"]
 WORLDS: tuple[World, ...] = ("prison", "narco")

@@ -97,6 +97,26 @@ class Recordings:
         )
 
     @staticmethod
+    def of_tracks(tracks_m: Sequence[Float64s | Float32s], is_detected: Sequence[Bools], step_s: float) -> "Recordings":
+        """Tracks of single targets, one an episode, without trackers and goals.
+
+        Args:
+            tracks_m: a track [T, 2] in metres each, at even steps; their lengths may differ.
+            is_detected: at which of its steps each target was seen, [T] bool.
+            step_s: seconds between steps.
+        """
+        length = [len(track) for track in tracks_m]
+        position = np.concatenate(tracks_m).astype(np.float32)
+        return Recordings(
+            step_s,
+            np.concatenate([[0], np.cumsum(length)]).astype(np.int64),
+            position,
+            np.concatenate(is_detected),
+            np.full((len(position), 0, 2), np.nan, dtype=np.float32),
+            np.full((len(length), 2), np.nan, dtype=np.float32),
+        )
+
+    @staticmethod
     def concatenate(parts: Sequence["Recordings"]) -> "Recordings":
         """All episodes of the parts, in order; missing trackers are absent (NaN).
 

@@ -32,6 +32,7 @@ FLOORS = {
         {"forecast", "train"},
         {"evaluate"},
         {"batch", "inspect"},
+        {"front"},
     ),
 }
 FORBIDDEN_MODULES = {"pickle", "cPickle", "dill", "joblib", "cloudpickle", "marshal", "shelve"}

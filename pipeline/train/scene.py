@@ -11,6 +11,7 @@ from cadence.diffusion.scene_frame import SceneConfig
 from cadence.network.attention import Team
 from cadence.network.scene import Pieces, SceneInputs, SceneNetwork
 from cadence.training.loop import Loss, Trainer
+from cadence.training.place import untrained_network
 from cadence.training.scene import SceneWindows, diffusion_loss, energy_loss, scene_windows
 from pipeline.checkpoints import find_checkpoint, load_weights
 from pipeline.episodes.pool import EpisodePool, load_pool
@@ -35,13 +36,6 @@ def train_scene(out: Path, config: TrainConfig, progress: Progress, force: bool 
     if scene.start is not None:
         load_weights(find_checkpoint(scene.start), network)
     return train_scene_network(out, config, network, pool, held_out, progress, force)
-
-
-def untrained_network(model: SceneConfig, seed: int) -> SceneNetwork:
-    """The network of a configuration with the first weights that belong to a seed."""
-    with torch.random.fork_rng(devices=[]):  # layers take their first weights from the global stream, which is left as it was
-        torch.random.manual_seed(seed)
-        return model.build()
 
 
 def train_scene_network(

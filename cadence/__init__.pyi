@@ -1,0 +1,47 @@
+from .bank.bank import Bank
+from .baselines.kalman import ConstantVelocityKalman, OrnsteinUhlenbeckKalman
+from .baselines.library import TrajectoryLibrary
+from .constraints.obstacles import Obstacles
+from .diffusion.absolute import AbsoluteModel
+from .diffusion.feasible import GuidanceConfig
+from .diffusion.general import GeneralModel
+from .diffusion.sampler import sample_ddim, sample_ddpm, sample_dpmpp_2m, sample_rotation
+from .diffusion.scene import SceneModel
+from .errors import CadenceError
+from .metrics import ade, coverage, energy_score, mean_error, min_ade
+from .recordings import Recordings, cut_windows
+from .training.loop import OptimiserConfig
+from .training.place import place_config, train_place
+from .types import Context, Detections, Estimator, HypothesisSet, WindowBatch
+
+__all__ = [
+    "AbsoluteModel",
+    "Bank",
+    "CadenceError",
+    "ConstantVelocityKalman",
+    "Context",
+    "Detections",
+    "Estimator",
+    "GeneralModel",
+    "GuidanceConfig",
+    "HypothesisSet",
+    "Obstacles",
+    "OptimiserConfig",
+    "OrnsteinUhlenbeckKalman",
+    "Recordings",
+    "SceneModel",
+    "TrajectoryLibrary",
+    "WindowBatch",
+    "ade",
+    "coverage",
+    "cut_windows",
+    "energy_score",
+    "mean_error",
+    "min_ade",
+    "place_config",
+    "sample_ddim",
+    "sample_ddpm",
+    "sample_dpmpp_2m",
+    "sample_rotation",
+    "train_place",
+]

@@ -1,0 +1,89 @@
+"""A place learned from recorded tracks, in memory: arrays in, a trained estimator out.
+
+`cadence train` does the same with files: it validates, keeps a curve, and goes on where it was killed.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+
+from cadence.diffusion.scene import SceneModel, SceneSampling
+from cadence.diffusion.scene_frame import SceneConfig
+from cadence.network.scene import SceneNetwork, SceneNetworkConfig
+from cadence.recordings import Recordings
+from cadence.training.loop import OptimiserConfig, Trainer
+from cadence.training.scene import Dropout, diffusion_loss, scene_windows
+
+_ROOM = 1.05
+"""Map and step limits are those of the recordings with this much room."""
+
+
+def place_config(recordings: Recordings, network: SceneNetworkConfig | None = None) -> SceneConfig:
+    """Map, units and limits of a place as the recordings show them.
+
+    Args:
+        recordings: all targets that were seen there; ValueError where nothing moves.
+        network: sizes and inputs of the network.
+    """
+    position = recordings.position_m.astype(np.float64)
+    is_step = np.ones(len(position), dtype=bool)
+    is_step[recordings.offset[:-1]] = False  # from one track to the next nobody went
+    step_m = np.diff(position, axis=0, prepend=position[:1])[is_step]
+    low, high = position.min(axis=0), position.max(axis=0)
+    if not (high > low).any() or not len(step_m):
+        raise ValueError("place_config: nothing moves in these recordings")
+    middle = 0.5 * (low + high)
+    return SceneConfig(
+        network or SceneNetworkConfig(),
+        recordings.step_s,
+        (float(middle[0]), float(middle[1])),
+        float(0.5 * _ROOM * (high - low).max()),
+        float(np.sqrt(np.mean(step_m**2))),
+        float(_ROOM * np.linalg.norm(step_m, axis=1).max()),
+    )
+
+
+def train_place(
+    recordings: Recordings,
+    config: SceneConfig | None = None,
+    optimiser: OptimiserConfig | None = None,
+    batch_size: int = 64,
+    seed: int = 0,
+    on_step: Callable[[int, float], object] | None = None,
+) -> SceneModel:
+    """An estimator that forecasts in a place whose tracks it has learned; the same seed gives the same weights.
+
+    Args:
+        recordings: what was recorded there.
+        config: of the model; by default `place_config` of the recordings.
+        optimiser: how long and how fast to learn.
+        batch_size: windows a step, every step of every recording equally likely.
+        seed: of weights, windows and noise.
+        on_step: is called with the number of each step and its loss.
+    """
+    config = config or place_config(recordings)
+    trainer = Trainer(untrained_network(config, seed), optimiser or OptimiserConfig())
+    for step in range(trainer.config.num_steps):
+        rng = np.random.default_rng([seed, step])
+        rows = rng.integers(0, len(recordings.position_m), batch_size)
+        windows = scene_windows(recordings, rows, config, Dropout(), rng)
+        generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
+
+        def loss(network: torch.nn.Module) -> torch.Tensor:
+            assert isinstance(network, SceneNetwork)
+            return diffusion_loss(network, windows, config, 1.0, generator)  # noqa: B023 - is called at once
+
+        value = trainer.advance(loss)
+        if on_step is not None:
+            on_step(step, value)
+    learned = trainer.ema.network
+    assert isinstance(learned, SceneNetwork)
+    return SceneModel(learned.eval(), config, SceneSampling())
+
+
+def untrained_network(config: SceneConfig, seed: int) -> SceneNetwork:
+    """The network of a configuration with the first weights that belong to a seed."""
+    with torch.random.fork_rng(devices=[]):  # layers take their first weights from the global stream, which is left as it was
+        torch.random.manual_seed(seed)
+        return config.build()

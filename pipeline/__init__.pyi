@@ -1,0 +1,14 @@
+from .estimators.presets import load_forecaster
+from .front import Mission, evaluate_mission, open_mission, run_logs
+from .results import AgentHypotheses, MissionHypotheses, WindowHypotheses
+
+__all__ = [
+    "AgentHypotheses",
+    "Mission",
+    "MissionHypotheses",
+    "WindowHypotheses",
+    "evaluate_mission",
+    "load_forecaster",
+    "open_mission",
+    "run_logs",
+]
