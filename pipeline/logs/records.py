@@ -31,6 +31,8 @@ MESSAGE_HEAD: Final = struct.Struct("<HIQQ")
 """Channel id, sequence, log time and publish time in front of the data of a message."""
 INDEX_ENTRY: Final = np.dtype([("log_time", "<u8"), ("offset", "<u8")])
 """One message in a MessageIndex record; the offset is that of the message record inside the unpacked chunk."""
+DATA_END: Final = struct.Struct("<BQI")
+"""The end mark of the data as a whole record: opcode, length and the checksum over all data, 0 where there is none."""
 CHUNK_HEAD: Final = struct.Struct("<QQQII")
 """Start time, end time, uncompressed size, CRC and length of the name of the compression."""
 CHUNK_HEAD_BYTES: Final = 64

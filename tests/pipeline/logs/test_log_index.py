@@ -16,7 +16,7 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, Writer
 
 from cadence.errors import InputError
-from pipeline.logs import rows, salvage, timeline
+from pipeline.logs import plan_builder, rows, timeline
 from pipeline.logs.indexed import plan_by_index
 from pipeline.logs.reader import MissionLog, open_log, open_parts, reopen
 from pipeline.logs.records import parse_chunk, parse_message_index, unpack_chunk, walk
@@ -95,7 +95,7 @@ def test_only_chunks_in_the_time_range_are_unpacked(write_log, monkeypatch):
 @pytest.mark.parametrize("form", INDEXED)
 def test_sound_chunks_are_not_walked(form, write_log, monkeypatch):
     path = write_log(recording(**FORMS[form]))
-    for module in (salvage, timeline):
+    for module in (plan_builder, timeline):
         monkeypatch.setattr(module, "rows_by_walk", lambda *_: pytest.fail("walked"))
     assert len(list(open_log(path).messages())) == NUM_MESSAGES
 
@@ -192,7 +192,7 @@ def test_reopened_log_is_the_log(form, write_log, monkeypatch):
     path = write_log(recording(**FORMS[form]))
     log = open_log(path)
     if form in INDEXED:
-        monkeypatch.setattr(salvage, "unpack_chunk", lambda _: pytest.fail("unpacked"))
+        monkeypatch.setattr(plan_builder, "unpack_chunk", lambda _: pytest.fail("unpacked"))
     again = reopen([path], log.health)
     assert again == log or form not in INDEXED
     assert content(again) == content(log) and again.metadata() == log.metadata() and again.health == log.health

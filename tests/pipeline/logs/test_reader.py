@@ -8,7 +8,7 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 
 from cadence.errors import InputError
-from pipeline.logs import salvage
+from pipeline.logs.file_walk import FileWalk
 from pipeline.logs.reader import open_log, utc
 
 REAL = [
@@ -104,8 +104,8 @@ def test_messages_of_all_sizes_outside_chunks_are_read_many_at_once(write_log, m
         writer.add_message(ids[i % len(ids)], 2**63 if i == 3000 else i // 3, bytes(size), i, i)
     writer.finish()
     one_by_one = []
-    record = salvage._Scanner._record
-    monkeypatch.setattr(salvage._Scanner, "_record", lambda self: one_by_one.append(self.position) or record(self))
+    head = FileWalk.head
+    monkeypatch.setattr(FileWalk, "head", lambda self: one_by_one.append(self.position) or head(self))
     log = open_log(write_log(file.getvalue()))
     assert content(log) == [message for message in reference(file.getvalue()) if message[3] < 2**63]
     assert log.health.problems[0] == "1 messages have log times after the year 2262 and cannot be used."
