@@ -192,12 +192,12 @@ def test_checker_agrees_with_dense_sampling(seed):
     g = torch.Generator().manual_seed(seed)
     track = torch.rand(6, 5, 2, generator=g, dtype=torch.float64) * 120 - 10
     offset = torch.rand(6, 1, 2, generator=g, dtype=torch.float64) * 10
-    share = torch.linspace(0, 1, 400, dtype=torch.float64)[:, None]
+    share = torch.linspace(0, 1, 200, dtype=torch.float64)[:, None]
     absolute = track + offset
     sampled = absolute[:, :-1, None] * (1 - share) + absolute[:, 1:, None] * share
     nearest = obstacles.signed_distance(sampled)[0].amin(dim=-1)
     hit = segments_in_collision(track, obstacles, offset_m=offset)
-    spacing = (absolute[:, 1:] - absolute[:, :-1]).norm(dim=-1) / 399
+    spacing = (absolute[:, 1:] - absolute[:, :-1]).norm(dim=-1) / 199
     assert bool(hit[nearest < 0].all()), "a sampled state lies inside, the segment counts as free"
     assert not bool(hit[nearest > spacing].any()), "no state comes near, the segment counts as blocked"
     states = states_in_collision(track, obstacles, offset_m=offset)

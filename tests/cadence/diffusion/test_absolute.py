@@ -244,11 +244,11 @@ def test_one_batch_is_learned_by_heart():
     with torch.random.fork_rng():
         torch.random.default_generator.manual_seed(4)
         network = TrajectoryNetwork(config.network)
-    optimiser = torch.optim.Adam(network.parameters(), lr=6e-3)
+    optimiser = torch.optim.Adam(network.parameters(), lr=1e-2)
     schedule = config.network.schedule()
     losses = []
-    for step in range(300):
-        optimiser.param_groups[0]["lr"] = 6e-3 * min(1.0, 2.0 * (1 - step / 300))
+    for step in range(150):
+        optimiser.param_groups[0]["lr"] = 1e-2 * min(1.0, 2.0 * (1 - step / 150))
         loss = absolute_loss(network, many, schedule, generator)
         optimiser.zero_grad()
         loss.backward()

@@ -266,7 +266,7 @@ def test_ring_of_cells_has_a_hole_and_separate_cells_are_separate(tmp_path):
 
 
 def test_touching_corners_and_large_grids_are_valid(tmp_path):
-    cells = (np.random.default_rng(0).random((300, 300)) < 0.3) * 100
+    cells = (np.random.default_rng(0).random((120, 120)) < 0.3) * 100
     log = make_log(tmp_path / "a.mcap", messages=[occupancy_message(cells=cells.tolist())])
     entries = collect_obstacles(log, ObstacleSources(), LOCAL)
     assert sum(map(area, entries)) == pytest.approx((cells > 0).sum() * 4)
