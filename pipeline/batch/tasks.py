@@ -1,6 +1,6 @@
 """A batch as tasks: one mission each, that any process on any machine can run, and an outcome that can be sent back.
 
-Where tasks run is decided by an engine (`pipeline/engines`).
+Where tasks run is decided by an engine (`pipeline/batch/engines`).
 """
 
 import contextlib

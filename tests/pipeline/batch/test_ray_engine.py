@@ -29,8 +29,8 @@ def cluster():
     pytest.importorskip("ray", reason="needs the extra ray")
     ray = module._ray()
     with pytest.MonkeyPatch.context() as patch:
-        here = Path(__file__).parent
-        patch.setenv("PYTHONPATH", os.pathsep.join(map(str, (here, here.parent))))  # workers import this module for its tasks
+        folders = [Path(__file__).parents[level] for level in (0, 2, 3)]  # of this module, of fixtures, of the packages
+        patch.setenv("PYTHONPATH", os.pathsep.join(map(str, folders)))  # workers import this module for its tasks
         with module._connected(ray, 2):
             yield ray
 

@@ -1,0 +1,85 @@
+"""Worker processes of this machine that do not do what they are told to."""
+
+import os
+import signal
+import time
+from multiprocessing.context import ForkServerProcess
+
+import pytest
+
+from cadence.errors import DeviceError
+from pipeline.batch.engines import local
+from pipeline.batch.engines.local import run_in_processes
+from pipeline.batch.tasks import LogOutcome, LogTask, RunConfig
+
+pytestmark = pytest.mark.timeout(300)  # on a busy machine the first process takes long to import everything
+
+
+def bare_tasks(num_tasks):
+    return [LogTask(i, (f"log{i}.mcap",), f"out/log{i}", 0, RunConfig()) for i in range(num_tasks)]
+
+
+def die_after_first_task(task, progress):
+    """All but the first kill the process that runs them."""
+    if task.index == 0:
+        return LogOutcome(task)
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def sleep_on(task, progress):
+    """Deaf to SIGTERM."""
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    progress.note(str(os.getpid()))
+    time.sleep(500)
+
+
+def test_a_task_whose_process_dies_has_a_failed_outcome_and_the_rest_go_on():
+    outcomes = list(run_in_processes(bare_tasks(3), die_after_first_task, lambda task, told: None, 1))
+    assert [outcome.exit_code for outcome in outcomes] == [0, DeviceError.exit_code, DeviceError.exit_code]
+    assert "log1.mcap: its worker process ended by SIGKILL; if memory ran out, use fewer --workers" in outcomes[1].message
+
+
+def test_a_worker_that_is_gone_is_not_given_the_next_task(monkeypatch):
+    """Its death is noticed when the task is sent; another worker runs it."""
+    given = []
+
+    def gone_at_first(worker, task):
+        given.append(task.index)
+        if given.count(task.index) == 1 and task.index == 1:
+            worker.process.kill()
+            worker.process.join()
+        return send(worker, task)
+
+    send = local._Worker.give
+    monkeypatch.setattr(local._Worker, "give", gone_at_first)
+    outcomes = list(run_in_processes(bare_tasks(2), succeed, lambda task, told: None, 1))
+    assert [outcome.exit_code for outcome in outcomes] == [0, 0] and given == [0, 1, 1]
+
+
+def succeed(task, progress):
+    return LogOutcome(task)
+
+
+def test_a_worker_that_does_not_end_is_killed(monkeypatch):
+    monkeypatch.setattr(local, "_GRACE_S", 0.2)
+    pids = []
+
+    def stop(task, told):
+        pids.append(int(told))
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        list(run_in_processes(bare_tasks(1), sleep_on, stop, 1))
+    with pytest.raises(ProcessLookupError):
+        os.kill(pids[0], 0)
+
+
+def test_no_process_can_be_started(monkeypatch):
+    def refuse(process):
+        raise OSError(11, "Resource temporarily unavailable")
+
+    monkeypatch.setattr(ForkServerProcess, "start", refuse)
+    before = dict(os.environ)
+    with pytest.raises(DeviceError, match=r"no worker process can be started \(Resource temp.*\); use fewer --workers"):
+        list(run_in_processes(bare_tasks(1), succeed, lambda task, told: None, 1))
+    assert dict(os.environ) == before
