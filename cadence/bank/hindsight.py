@@ -14,7 +14,8 @@ from cadence.types import Detections, Estimator, WindowBatch
 
 NUM_SAMPLES = 24
 _WITHHELD_STEPS = 1.5
-_LEAST_TESTS = 8
+LEAST_TESTS = 8
+"""Detections without which nothing is chosen."""
 
 
 def candidates(bank: Bank) -> tuple[Bank, ...]:
@@ -33,7 +34,7 @@ def choose_by_hindsight(bank: Bank, windows: WindowBatch, later: Detections) -> 
 
     Without enough of them the bank stays as it is.
     """
-    if windows.num_windows == 0 or num_tests(windows, later) < _LEAST_TESTS or bank.log_weight is None:
+    if windows.num_windows == 0 or num_tests(windows, later) < LEAST_TESTS or bank.log_weight is None:
         return bank
     scores = [float(hindsight_scores(candidate, windows, later).mean()) for candidate in candidates(bank)]
     return candidates(bank)[scores.index(min(scores))]

@@ -9,11 +9,10 @@ import math
 
 from torch import Tensor
 
-from cadence.bank.hindsight import hindsight_scores, num_tests, withhold
+from cadence.bank.hindsight import LEAST_TESTS, hindsight_scores, num_tests, withhold
 from cadence.diffusion.general import GateScores, GeneralModel
 from cadence.types import Detections, WindowBatch
 
-_LEAST_TESTS = 8
 _SHARES = (0.5, 1.0, 0.0)
 
 
@@ -45,7 +44,7 @@ class _Choice:
 
 
 def _choose(model: GeneralModel, windows: WindowBatch, unseen: Detections) -> _Choice:
-    if num_tests(windows, unseen) < _LEAST_TESTS:
+    if num_tests(windows, unseen) < LEAST_TESTS:
         return _Choice(_SHARES[0], None, None)
     half, network, bank = (
         hindsight_scores(dataclasses.replace(model, share_past=share, share_future=share), windows, unseen) for share in _SHARES

@@ -7,12 +7,17 @@ from cadence.baselines.kalman import ConstantVelocityKalman, OrnsteinUhlenbeckKa
 from cadence.types import Estimator
 from pipeline.estimators.fitting import FittingData
 
+
+def _tuned(rival: ConstantVelocityKalman | OrnsteinUhlenbeckKalman, data: FittingData) -> Estimator:
+    return rival.fit(data.tracks, data.grid.step_s).tuned(*data.hindsight_windows())
+
+
 RIVALS: Mapping[str, Callable[[FittingData], Estimator]] = {
     "bank": FittingData.fitted_bank,
-    "cv": lambda data: ConstantVelocityKalman().fit(data.tracks, data.grid.step_s),
-    "ou": lambda data: OrnsteinUhlenbeckKalman().fit(data.tracks, data.grid.step_s),
+    "cv": lambda data: _tuned(ConstantVelocityKalman(), data),
+    "ou": lambda data: _tuned(OrnsteinUhlenbeckKalman(), data),
     "linear": lambda data: LinearInterpolation().fit(data.tracks),
     "hold": lambda data: Hold().fit(data.tracks),
 }
 """bank: the bank of motion models that the diffusion model starts from; cv, ou: Kalman + RTS with constant velocity and with
-Ornstein-Uhlenbeck velocity; linear, hold: interpolation."""
+Ornstein-Uhlenbeck velocity, fitted by likelihood and then by hindsight, as the bank; linear, hold: interpolation."""

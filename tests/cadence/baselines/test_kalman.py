@@ -7,10 +7,11 @@ import torch
 from fixtures.bank import as_tracks, random_windows, simulate
 
 from cadence.bank.components import constant_velocity, ornstein_uhlenbeck
-from cadence.bank.fitting import log_likelihood
+from cadence.bank.fitting import FLOOR_STEPS, log_likelihood
+from cadence.bank.hindsight import hindsight_scores
 from cadence.bank.rows import track_rows
 from cadence.baselines.kalman import ConstantVelocityKalman, OrnsteinUhlenbeckKalman
-from cadence.types import Detections, Estimator
+from cadence.types import Detections, Estimator, WindowBatch
 
 RIVALS = [ConstantVelocityKalman(), OrnsteinUhlenbeckKalman()]
 TIMES = torch.arange(12, dtype=torch.float64) * 2.0
@@ -69,6 +70,52 @@ def test_nothing_to_learn_from(rival: Estimator) -> None:
     lone = dataclasses.replace(lone, is_observed=torch.arange(7).expand(8, 1, 7) < 1)
     for tracks in (nothing, lone):
         assert torch.isfinite(rival.fit(tracks).sample(WINDOWS, 2).position_m).all()
+
+
+def steady_and_few_wild(num_steady: int = 30, num_wild: int = 3) -> tuple[WindowBatch, Detections]:
+    """Windows of targets that go straight, with a few that do not, and their detections after the origin."""
+    times = torch.arange(20, dtype=torch.float64) * 2.0
+    parts = [
+        simulate(constant_velocity([noise], initial_speed=1.0), times, 0.02, number, 5)
+        for noise, number in ((1e-5, num_steady), (3.0, num_wild))
+    ]
+    fields = [field.name for field in dataclasses.fields(Detections)]
+    both = Detections(*(torch.cat([getattr(part, name) for part in parts]) for name in fields))
+    both = dataclasses.replace(both, time_s=both.time_s - 26.0)
+    past, later = (Detections(*(getattr(both, name)[:, :, cut] for name in fields)) for cut in (slice(14), slice(14, None)))
+    return WindowBatch(torch.arange(-27.0, 13.0, dtype=torch.float64), past, torch.arange(num_steady + num_wild), 27), later
+
+
+@pytest.mark.parametrize("rival", RIVALS, ids=lambda rival: rival.name)
+def test_hindsight_finds_what_likelihood_misses(rival: ConstantVelocityKalman) -> None:
+    windows, later = steady_and_few_wild()
+    fitted = rival.fit(windows.detections, 1.0)
+    tuned = fitted.tuned(windows, later)
+    # a few wild targets make the noise of greatest likelihood far too great for all others
+    assert float(tuned.bank.models.diffusion) < 0.1 * float(fitted.bank.models.diffusion)
+    by_likelihood, by_hindsight = (float(hindsight_scores(one, windows, later).mean()) for one in (fitted, tuned))
+    assert by_hindsight < 0.8 * by_likelihood
+
+
+@pytest.mark.parametrize("rival", RIVALS, ids=lambda rival: rival.name)
+def test_too_few_detections_to_compare_change_nothing(rival: ConstantVelocityKalman) -> None:
+    fitted = rival.fit(as_tracks(WINDOWS.detections), 1.0)
+    nothing = dataclasses.replace(WINDOWS.detections, is_observed=torch.zeros_like(WINDOWS.detections.is_observed))
+    few = dataclasses.replace(WINDOWS, detections=dataclasses.replace(
+        WINDOWS.detections, is_observed=torch.arange(7).expand(4, 2, 7) < 2))  # fmt: skip
+    assert fitted.tuned(few, nothing) is fitted
+
+
+def test_noise_of_detections_adds_to_their_own() -> None:
+    fitted = ConstantVelocityKalman().fit(as_tracks(WINDOWS.detections), 1.0)
+    length_m, floor = fitted.bank.length_m(WINDOWS.step_s), FLOOR_STEPS
+    noisier = dataclasses.replace(fitted, noise_steps=0.5)
+    d = WINDOWS.detections
+    added = (0.5**2 - floor**2) * length_m**2 * torch.eye(2, dtype=torch.float64)
+    stated = dataclasses.replace(WINDOWS, detections=dataclasses.replace(d, covariance_m2=d.covariance_m2 + added))
+    torch.testing.assert_close(noisier.sample(WINDOWS, 3).position_m, fitted.sample(stated, 3).position_m)
+    assert torch.equal(dataclasses.replace(fitted, noise_steps=0.0).sample(WINDOWS, 3).position_m,
+                       fitted.sample(WINDOWS, 3).position_m)  # fmt: skip
 
 
 def test_units_of_time_do_not_matter() -> None:
