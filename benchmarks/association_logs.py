@@ -19,8 +19,7 @@ class Log:
 
     time_s [N], position_m [N, 2], sigma_m of the detections, origin [N] which agent caused them; truth_m [A, T, 2] at
     grid_s [T], NaN where unknown; num_agents is what every tracker is told, None: nothing; cutoff_m of GOSPA and OSPA;
-    speed_mps of a typical target; seen_share: how likely it is that a target is seen in a scan; moments from scored_from_s on
-    are scored.
+    speed_mps of a typical target, which the rivals alone are told; moments from scored_from_s on are scored.
     """
 
     time_s: Float64s
@@ -32,7 +31,6 @@ class Log:
     num_agents: int | None
     cutoff_m: float
     speed_mps: float
-    seen_share: float
     scored_from_s: float = 0.0
 
     def until(self, end_s: float) -> "Log":
@@ -70,9 +68,7 @@ def rendezvous_logs(seed: int, number: int) -> list[Log]:
         seen = episodes.recordings.is_detected[first : first + track.shape[0] * track.shape[1]].reshape(track.shape[:2])
         step, agent = np.nonzero(seen.T)
         grid, place = np.arange(0, track.shape[1], 6), track[agent, step]
-        logs.append(
-            Log(step * 60.0, place, 1.0, agent, grid * 60.0, track[:, grid], len(track), 1000.0, 2.2, float(seen.mean()))
-        )
+        logs.append(Log(step * 60.0, place, 1.0, agent, grid * 60.0, track[:, grid], len(track), 1000.0, 2.2))
     return logs
 
 
@@ -106,6 +102,4 @@ def ship_log() -> Log:
         nearest = np.clip(np.searchsorted(times, seen - 1e-6), 0, len(times) - 1)
         is_same = np.abs(times[nearest] - seen) < 1e-6
         cause[row, is_same] = np.hypot(*(points[nearest] - position)[is_same].T)
-    return Log(
-        seen, position, 15.0, cause.argmin(0), grid, np.stack(tracks), None, 100.0, 3.0, 1.0 / len(tracks), 0.25 * grid[-1]
-    )
+    return Log(seen, position, 15.0, cause.argmin(0), grid, np.stack(tracks), None, 100.0, 3.0, 0.25 * grid[-1])
