@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from cadence.errors import CadenceError, UsageError
+from cadence.errors import CadenceError, PartialInputError, UsageError
 from pipeline.batch.summaries import batch_summary, log_record, stage_exit_code, stage_summary, to_json
 from pipeline.config import stage_config
 from pipeline.manifest import StageResult
@@ -21,7 +21,6 @@ _STRICT = ["extract.is_strict=true"]
 
 app = typer.Typer(
     name="cadence",
-    no_args_is_help=True,
     add_completion=False,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
@@ -75,19 +74,24 @@ ForecastOut = Annotated[Path | None, typer.Option("--out", metavar="DIR", help="
 
 
 @app.callback(invoke_without_command=True)
-def _root(version: Annotated[bool, typer.Option("--version", help="Print versions and leave.")] = False) -> None:
+def _root(
+    context: typer.Context, version: Annotated[bool, typer.Option("--version", help="Print versions and leave.")] = False
+) -> None:
     if version:
         from pipeline.provenance import versions
 
         typer.echo(", ".join(f"{name} {number}" for name, number in versions().items()))
         raise typer.Exit
+    if context.invoked_subcommand is None:
+        typer.echo(context.get_help())
 
 
 @app.command()
-def info(log: Log, as_json: Json = False) -> None:
+def info(log: Log, as_json: Json = False) -> int:
     """Show what is in a log, and the settings that fit it.
 
-    Channels, schemas, rates, time range, health; which channels look like detections, truth, frames or obstacles.
+    Channels, schemas, rates, time range, health; which channels look like detections, truth, frames or obstacles. Exit
+    code 7 where messages are lost, or may be.
 
     \b
     Examples:
@@ -98,6 +102,7 @@ def info(log: Log, as_json: Json = False) -> None:
 
     description = describe_log(log)
     typer.echo(to_json(description) if as_json else render(description))
+    return 0 if description.health.is_complete else PartialInputError.exit_code
 
 
 @app.command()
@@ -160,10 +165,11 @@ def run(
 def ingest(
     log: Log, out: Out, config: Config = None, settings: Set = None, force: Force = False, quiet: Quiet = False,
     as_json: Json = False,
-) -> None:  # fmt: skip
+) -> int:  # fmt: skip
     """Stage 1: catalogue a log.
 
-    Channels, rates, health and a suggested mapping go into the mission directory DIR/<name of the log>.
+    Channels, rates, health and a suggested mapping go into the mission directory DIR/<name of the log>. Exit code 7 where
+    messages are lost, or may be.
 
     \b
     Example:
@@ -173,7 +179,8 @@ def ingest(
     from pipeline.ingest.stage import ingest as stage
 
     directory = mission_directories([log], out)[log]
-    _show(stage(log, directory, stage_config(IngestConfig, "ingest", config, settings or ()), Progress(quiet), force), as_json)
+    resolved = stage_config(IngestConfig, "ingest", config, settings or ())
+    return _show(stage(log, directory, resolved, Progress(quiet), force), as_json)
 
 
 @app.command()
@@ -183,7 +190,7 @@ def extract(
 ) -> int:  # fmt: skip
     """Stage 2: get the detections out of the log.
 
-    Detections, truth, sensor poses and obstacles, in one metric frame.
+    Detections, truth, sensor poses and obstacles, in one metric frame. Exit code 7 where the log is damaged.
 
     \b
     Examples:
@@ -194,9 +201,7 @@ def extract(
     from pipeline.extract.stage import extract as stage
 
     resolved = stage_config(ExtractConfig, "extract", config, [*(settings or ()), *_STRICT * strict], seed)
-    result = stage(mission, resolved, Progress(quiet), force)
-    _show(result, as_json)
-    return stage_exit_code(result)
+    return _show(stage(mission, resolved, Progress(quiet), force), as_json)
 
 
 @app.command()
@@ -338,8 +343,10 @@ def _complain(error: CadenceError | str) -> None:
     typer.echo(f"cadence: error: {' '.join(str(error).split())}", err=True)
 
 
-def _show(result: StageResult, as_json: bool) -> None:
+def _show(result: StageResult, as_json: bool) -> int:
+    """Print what a stage did; its exit code."""
     typer.echo(to_json(result) if as_json else stage_summary(result))
+    return stage_exit_code(result)
 
 
 if __name__ == "__main__":

@@ -12,6 +12,7 @@ from pathlib import Path
 from cadence.errors import DeviceError
 
 _POLL_S = 0.1
+_NUM_RETRIES, _RETRY_S = 100, 0.001
 
 
 @contextlib.contextmanager
@@ -55,13 +56,7 @@ def _is_held(folder: Path) -> bool:
 def _hold(folder: Path, on_wait: Callable[[str], object]) -> int:
     has_told = False
     while True:
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            handle = os.open(folder, os.O_RDONLY)
-        except FileNotFoundError:  # removed by the one who had it before us
-            continue
-        except OSError as error:
-            raise DeviceError(f"{folder}: cannot write there ({error.strerror}); choose another folder with --out") from error
+        handle = _opened(folder)
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
             if _is_same(folder, handle):
@@ -75,6 +70,23 @@ def _hold(folder: Path, on_wait: Callable[[str], object]) -> int:
             on_wait(f"{folder}: cannot be locked ({error.strerror}); do not run two at a time on it")
             return handle
         os.close(handle)
+
+
+def _opened(folder: Path) -> int:
+    """A handle on the folder, made where it is absent."""
+    failure: OSError | None = None
+    for _ in range(_NUM_RETRIES):
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            return os.open(folder, os.O_RDONLY)
+        except FileNotFoundError as error:  # who had it before us may remove it or its parent; in /proc it stays so
+            failure = error
+            time.sleep(_RETRY_S)
+        except OSError as error:
+            failure = error
+            break
+    reason = failure.strerror if failure is not None else ""
+    raise DeviceError(f"{folder}: cannot write there ({reason}); choose another folder with --out") from failure
 
 
 def _is_same(folder: Path, handle: int) -> bool:

@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from fixtures.line_logs import straight_line, write_log
 
 import cli
 from cadence.errors import InputError
@@ -182,3 +183,20 @@ def test_closed_pipe_is_quiet():
     command = f"'{sys.executable}' cli.py --help | true; exit ${{PIPESTATUS[0]}}"
     finished = subprocess.run(["bash", "-c", command], cwd=ROOT, capture_output=True, text=True, check=False)
     assert finished.stderr == "" and finished.returncode in (0, 1)
+
+
+def test_no_command_prints_the_help(capsys):
+    assert cli.main([]) == 0
+    captured = capsys.readouterr()
+    assert captured.err == "" and "Usage: cadence [OPTIONS] COMMAND" in captured.out and "\n  doctor " in captured.out
+
+
+def test_damage_has_its_code_in_every_command_that_reads_the_log(tmp_path, capsys):
+    whole = write_log(tmp_path / "whole.mcap", straight_line(200))
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(whole.read_bytes()[: whole.stat().st_size // 2])
+    for log, code in ((whole, 0), (cut, 7)):
+        assert cli.main(["info", str(log)]) == code
+        assert cli.main(["ingest", str(log), "--out", str(tmp_path / "out"), "-q"]) == code
+        assert cli.main(["extract", str(tmp_path / "out" / log.stem), "-q"]) == code
+    assert "DAMAGED" in capsys.readouterr().out

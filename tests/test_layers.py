@@ -235,7 +235,7 @@ def test_exceptions_from_the_limits_are_needed():
 
 def test_command_line_stays_thin():
     # most of it is help: a docstring with examples for each of the commands
-    assert len((ROOT / "cli.py").read_text(encoding="utf-8").splitlines()) < 350
+    assert len((ROOT / "cli.py").read_text(encoding="utf-8").splitlines()) < 360
 
 
 def test_top_level_is_what_the_plan_says():
