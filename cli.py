@@ -154,11 +154,12 @@ def run(
 
     chosen = [*(settings or ()), *_COMBINED * combined, *_STRICT * strict, *selection_settings(start, end, topic or ())]
     resolved = stage_config(RunConfig, None, config, chosen, seed)
-    outcomes = run_all(logs, out, resolved, Progress(quiet), force, engine, workers, report)
+    unwritten: list[CadenceError] = []
+    outcomes = run_all(logs, out, resolved, Progress(quiet), force, engine, workers, report, unwritten.append)
     typer.echo(to_json([log_record(outcome) for outcome in outcomes]) if as_json else batch_summary(outcomes))
-    for complaint in complaints(outcomes):
+    for complaint in (*complaints(outcomes), *map(str, unwritten)):
         _complain(complaint)
-    return exit_code(outcomes)
+    return exit_code(outcomes, unwritten)
 
 
 @app.command()

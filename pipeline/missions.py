@@ -18,6 +18,12 @@ from pipeline.stores.urls import is_url, shown, url_name
 CATALOGUE_NAME: Final = "catalogue.json"
 """What ingest leaves in a mission directory (`pipeline.catalogue`): by it one is known."""
 
+REPORT_NAME: Final = "batch.json"
+"""What became of a batch, beside its mission directories."""
+
+_TAKEN_NAMES: Final = (REPORT_NAME, "scores.json", "scores.csv", "scores.md")
+"""Files beside mission directories: a log may be called batch.json.mcap."""
+
 _OWN_ENDINGS: Final = (".cadence.mcap", ".combined.mcap")
 
 
@@ -155,8 +161,8 @@ def _place(part: str) -> Path:
 def _directories(groups: Sequence[tuple[str, ...]], out: str) -> list[str]:
     """`out`/<name of the mission>; with a hash of where the first part lies, where others share the name.
 
-    Others: among the missions given, or one that was run into that directory earlier and whose log still exists. The mission
-    whose results are there already keeps the plain name.
+    Others: among the missions given, or one that was run into that directory earlier and whose log still exists, or a file
+    that lies beside mission directories. The mission whose results are there already keeps the plain name.
     """
     names = [mission_name([_place(part) for part in group]) for group in groups]
     counts = Counter(names)
@@ -165,6 +171,7 @@ def _directories(groups: Sequence[tuple[str, ...]], out: str) -> list[str]:
         plain, place = f"{out.rstrip('/') or '/'}/{name}", _place(group[0])
         holder = None if is_url(out) else _ingested_log(Path(plain))
         is_shared = counts[name] > 1 or (holder is not None and holder.exists())
+        is_shared |= name in _TAKEN_NAMES
         suffix = "-" + hashlib.sha256(str(place).encode()).hexdigest()[:8]
         found.append(plain + suffix if is_shared and holder != place else plain)
     return found

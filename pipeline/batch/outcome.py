@@ -4,7 +4,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
-from cadence.errors import ImplausibleInputError, NothingDetectedError, PartialInputError
+from cadence.errors import CadenceError, ImplausibleInputError, NothingDetectedError, PartialInputError
 from pipeline.extract.plausibility import suspicions_in
 from pipeline.manifest import StageResult
 from pipeline.stores.urls import shown
@@ -83,14 +83,15 @@ class LogOutcome:
         return tuple(line for stage in self.stages for line in suspicions_in(stage.summary))
 
 
-def exit_code(outcomes: Sequence[LogOutcome]) -> int:
+def exit_code(outcomes: Sequence[LogOutcome], unwritten: Sequence[CadenceError] = ()) -> int:
     """The highest code of the failures; without any 8 where something is suspected, else 7 where a log is damaged.
 
     3 where nothing was detected in any; else 0. Suspicion counts more than damage: a gap is seen as a gap, a wrong place is
-    believed.
+    believed. That a report could not be written (`unwritten`) is a failure, too.
     """
-    if any(outcome.exit_code for outcome in outcomes):
-        return max(outcome.exit_code for outcome in outcomes)
+    failures = [outcome.exit_code for outcome in outcomes if outcome.exit_code] + [error.exit_code for error in unwritten]
+    if failures:
+        return max(failures)
     if any(outcome.status == "doubtful" for outcome in outcomes):
         return ImplausibleInputError.exit_code
     if any(outcome.status == "partial" for outcome in outcomes):

@@ -7,7 +7,7 @@ import signal
 import threading
 import time
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from types import FrameType
@@ -15,7 +15,7 @@ from typing import Literal
 
 from tqdm import tqdm
 
-from cadence.errors import CadenceError, UsageError
+from cadence.errors import CadenceError, DeviceError, UsageError
 from pipeline.batch.config import RunConfig
 from pipeline.batch.engines.local import run_in_processes, run_in_sequence
 from pipeline.batch.engines.ray import run_on_ray
@@ -25,11 +25,10 @@ from pipeline.batch.summaries import batch_record, to_json
 from pipeline.batch.tasks import STAGES, Engine, plan_tasks, run_tasks
 from pipeline.catalogue import Catalogue, read_catalogue
 from pipeline.manifest import hash_file, manifest_path
-from pipeline.missions import CATALOGUE_NAME
+from pipeline.missions import CATALOGUE_NAME, REPORT_NAME
 from pipeline.progress import Progress, Told
 from pipeline.stores.urls import is_url
 
-REPORT_NAME = "batch.json"
 _WORKER_BYTES = 2_000_000_000
 _MEMINFO = Path("/proc/meminfo")
 
@@ -39,15 +38,18 @@ EngineName = Literal["local", "ray"]
 def run(
     logs: Sequence[str], out: str, config: RunConfig, progress: Progress, force: bool = False,
     engine: EngineName = "local", num_workers: int | None = None, report: Path | None = None,
+    on_unwritten: Callable[[CadenceError], object] | None = None,
 ) -> tuple[LogOutcome, ...]:  # fmt: skip
     """Run all stages on every mission among `logs`, each in its own mission directory under `out`; outcomes in their order.
 
-    Writes `out`/batch.json, and the same to `report`. `num_workers`: processes; 0 runs in this one; None chooses.
-    Raises `UsageError` or `InputError` where there is no log at all.
+    Writes `out`/batch.json, and the same to `report`; `on_unwritten` hears of one that cannot be written, so that the
+    outcomes are not lost with it (without it, that is raised). `num_workers`: processes; 0 runs in this one; None chooses.
+    Raises `UsageError` or `InputError` where there is no log at all, `DeviceError` where nothing can be written to `out`.
     """
     started_s = time.monotonic()
     out = out.removeprefix("file://").rstrip("/") or "/"
     tasks = plan_tasks(logs, out, config, force)
+    _make_folder(out)
     chosen = choose_engine(engine, len(tasks), num_workers)
     if len(tasks) > 1:
         progress.note(_plan_line(tasks))
@@ -56,9 +58,30 @@ def run(
     with _interruptible(), contextlib.closing(_Shown(tasks, progress)) as shown:
         outcomes = run_tasks(tasks, chosen, shown.finished, shown.watch, run_anywhere)
     text = to_json(batch_record(outcomes, exit_code(outcomes), time.monotonic() - started_s)) + "\n"
-    for place in [f"{out}/{REPORT_NAME}", *([str(report)] if report is not None else [])]:
-        write_text(place, text)
+    _write_everywhere([f"{out}/{REPORT_NAME}", *([str(report)] if report is not None else [])], text, on_unwritten)
     return outcomes
+
+
+def _make_folder(out: str) -> None:
+    """What every log would fail with is said once, before any work is done."""
+    if not is_url(out):
+        try:
+            Path(out).mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise DeviceError(f"{out}: cannot write there ({error.strerror}); choose another folder with --out") from error
+
+
+def _write_everywhere(places: Sequence[str], text: str, on_unwritten: Callable[[CadenceError], object] | None) -> None:
+    failures = []
+    for place in places:
+        try:
+            write_text(place, text)
+        except CadenceError as error:
+            failures.append(error)
+    for failure in failures:
+        if on_unwritten is None:
+            raise failure
+        on_unwritten(failure)
 
 
 def selection_settings(start: str | None, end: str | None, topics: Sequence[str]) -> list[str]:

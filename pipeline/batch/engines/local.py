@@ -1,5 +1,6 @@
 """Tasks on this machine: one after the other in this process, or in worker processes that may die without harm to others."""
 
+import contextlib
 import functools
 import multiprocessing
 import os
@@ -18,6 +19,7 @@ from pipeline.batch.tasks import RunTask, Watch
 from pipeline.progress import RelayedProgress, Told
 
 _GRACE_S = 10.0
+_NUM_STARTS = 2
 _ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
@@ -39,9 +41,14 @@ def run_in_processes(
     try:
         while waiting or workers:
             while waiting and len(workers) < num_workers:
-                worker = _start(context, run, waiting.popleft())
-                workers[worker.connection] = worker
-            for connection in wait(list(workers)):
+                task = waiting.popleft()
+                try:
+                    worker = _start(context, run, task)
+                except DeviceError as error:  # the results of the others must not be lost with it
+                    yield LogOutcome(task, message=f"{task.log}: {error}", exit_code=error.exit_code)
+                else:
+                    workers[worker.connection] = worker
+            for connection in wait(list(workers)) if workers else ():
                 worker = workers[connection]  # type: ignore[index]
                 told = worker.hear()
                 if not isinstance(told, LogOutcome):
@@ -98,14 +105,22 @@ class _Worker:
 
 
 def _start(context: ForkServerContext, run: RunTask, task: LogTask) -> _Worker:
+    for _ in range(_NUM_STARTS - 1):  # where the process that forks them was killed, the next call finds a new one
+        with contextlib.suppress(DeviceError):
+            return _start_once(context, run, task)
+    return _start_once(context, run, task)
+
+
+def _start_once(context: ForkServerContext, run: RunTask, task: LogTask) -> _Worker:
     ours, theirs = context.Pipe()
     process = context.Process(target=_work, args=(theirs, run), daemon=True)
     before = {name: os.environ.get(name) for name in _ONE_THREAD}
     os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))  # libraries read it when they are first imported
     try:
         process.start()
-    except OSError as error:
-        raise DeviceError(f"no worker process can be started ({error.strerror}); use fewer --workers") from error
+    except (OSError, EOFError) as error:
+        reason = getattr(error, "strerror", None) or "the process that starts them ended"
+        raise DeviceError(f"no worker process can be started ({reason}); use fewer --workers") from error
     finally:
         for name, value in before.items():
             os.environ.pop(name) if value is None else os.environ.update({name: value})

@@ -145,6 +145,31 @@ def test_report_tells_of_every_log(calls, tmp_path):
     assert record["logs"][1]["error"] == {"message": "b.mcap: no detections", "exit_code": 3}
 
 
+def test_a_report_that_cannot_be_written_does_not_cost_the_outcomes(calls, tmp_path):
+    (tmp_path / "batch.json").mkdir()
+    report, unwritten = tmp_path / "night.json", []
+    outcomes = run(["a.mcap"], str(tmp_path), RunConfig(), QUIET, num_workers=0, report=report, on_unwritten=unwritten.append)
+    assert [outcome.status for outcome in outcomes] == ["done"] and json.loads(report.read_text())["num_done"] == 1
+    assert [str(error).split(": ")[0] for error in unwritten] == [f"{tmp_path}/batch.json"]
+    assert exit_code(outcomes) == 0 and exit_code(outcomes, unwritten) == 5
+    with pytest.raises(DeviceError, match=r"batch\.json: cannot write"):
+        run_here("a", tmp_path)
+
+
+def test_a_folder_that_cannot_be_made_is_said_before_any_work(calls, tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(DeviceError, match="file/out: cannot write there"):
+        run_here("ab", tmp_path / "file" / "out")
+    assert calls == []
+
+
+def test_a_log_may_be_called_like_a_file_beside_the_missions(calls, tmp_path):
+    outcomes = run_here(["batch.json", "scores.md", "a"], tmp_path)
+    names = [outcome.task.name for outcome in outcomes]
+    assert names[0].startswith("batch.json-") and names[1].startswith("scores.md-") and names[2] == "a"
+    assert json.loads((tmp_path / "batch.json").read_text())["num_logs"] == 3
+
+
 def test_a_number_of_workers_that_cannot_be(tmp_path):
     with pytest.raises(UsageError, match="--workers -1"):
         run(["a.mcap"], str(tmp_path), RunConfig(), QUIET, num_workers=-1)
