@@ -78,6 +78,7 @@ def ship_log() -> Log:
     from pipeline.ingest.stage import IngestConfig, ingest
     from pipeline.progress import Progress
     from pipeline.tables import read_table
+    from pipeline.tracks import interpolated
 
     quiet = Progress(quiet=True)
     with tempfile.TemporaryDirectory() as folder:
@@ -91,14 +92,12 @@ def ship_log() -> Log:
     place, position = (np.stack([table["x_m"].to_numpy(), table["y_m"].to_numpy()], 1) for table in (truth, detections))
     agent = np.array(truth["agent_id"].to_pylist())
     grid = np.arange(0.0, seen.max(), 60.0)
+    grid_ns = start + np.round(grid * 1e9).astype(np.int64)
     tracks, cause = [], np.full((len(np.unique(agent)), len(seen)), np.inf)
     for row, name in enumerate(np.unique(agent)):
         order = np.flatnonzero(agent == name)[np.argsort(when[agent == name], kind="stable")]
         times, points = when[order], place[order]
-        after = np.clip(np.searchsorted(times, grid), 1, len(times) - 1)
-        is_known = (grid >= times[0]) & (grid <= times[-1]) & (times[after] - times[after - 1] <= 120.0)
-        line = np.stack([np.interp(grid, times, points[:, axis]) for axis in (0, 1)], 1)
-        tracks.append(np.where(is_known[:, None], line, np.nan))
+        tracks.append(interpolated(truth["time_ns"].to_numpy()[order], points, grid_ns, 120e9))
         nearest = np.clip(np.searchsorted(times, seen - 1e-6), 0, len(times) - 1)
         is_same = np.abs(times[nearest] - seen) < 1e-6
         cause[row, is_same] = np.hypot(*(points[nearest] - position)[is_same].T)

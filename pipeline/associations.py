@@ -22,17 +22,18 @@ from cadence.association.types import CLUTTER, AssociationConfig, Associations, 
 from cadence.constraints.obstacles import Obstacles
 from cadence.errors import InputError
 from cadence.resampling import systematic
-from cadence.types import Detections, WindowBatch
-from pipeline.arrays import Bools, Float64s, Int64s
+from cadence.types import WindowBatch
+from pipeline.arrays import Float64s, Int64s
+from pipeline.tracks import DetectionTrack, track_of
 from pipeline.windows import (
-    DetectionTrack,
     Grid,
     GridConfig,
     MissionWindows,
     is_first_or_last,
     kept_tracks,
+    middle_m,
+    padded_detections,
     plan_grid,
-    track_of,
     window_seeds,
 )
 from schemas.tables import ASSOCIATIONS, LABELS
@@ -271,7 +272,7 @@ class WayWindows:
     def _laid_out(self, index: list[list[Int64s]], names: tuple[str, ...], window: Int64s) -> MissionWindows:
         whole = self.windows
         datum_m, origins_ns = whole.datum_m[window], whole.origins_ns[window]
-        detections = _padded(self._pool, index, len(names), origins_ns, datum_m)
+        detections = padded_detections(self._pool, _picked(index, len(names)), origins_ns, datum_m)
         pick = torch.from_numpy(window)
         context = None if whole.batch.context is None else whole.batch.context[pick]
         batch = WindowBatch(whole.batch.time_s, detections, whole.batch.seeds[pick], whole.batch.origin_index, context)
@@ -293,10 +294,9 @@ def build_way_windows(
     builder = _Reader(association, grid, known, agent_ids)
     seeds = window_seeds(seed, len(grid.origins_ns))
     readings = tuple(builder.read(b, int(seeds[b]), num_hypotheses) for b in range(len(seeds)))
-    index = [[_first(reading, agent) for agent in range(len(agent_ids))] for reading in readings]
-    datum_m = np.stack([builder.pool.position_m[np.concatenate([*rows, _NONE])].sum(axis=0) for rows in index])
-    datum_m = datum_m / np.array([max(sum(map(len, rows)), 1) for rows in index])[:, None]
-    found = _padded(builder.pool, index, len(agent_ids), grid.origins_ns, datum_m)
+    pick = _picked([[_first(reading, agent) for agent in range(len(agent_ids))] for reading in readings], len(agent_ids))
+    datum_m = middle_m(builder.pool, pick)
+    found = padded_detections(builder.pool, pick, grid.origins_ns, datum_m)
     batch = WindowBatch(grid.time_s, found, seeds, grid.origin_index)
     windows = MissionWindows(batch, grid.origins_ns, grid.step_ns, agent_ids, datum_m)
     probability, entropy = (np.stack([getattr(r, name) for r in readings]) for name in ("probability", "entropy_bits"))
@@ -320,9 +320,7 @@ class _Reader:
     @cached_property
     def pool(self) -> DetectionTrack:
         """The stream, and after it the detections of the agents that the log names, in the order of `known`."""
-        parts = [self.association.stream, *self.known.values()]
-        columns = ("time_ns", "position_m", "covariance_m2")
-        return DetectionTrack(*(np.concatenate([getattr(part, name) for part in parts]) for name in columns))
+        return DetectionTrack.one_behind_the_other([self.association.stream, *self.known.values()])
 
     @cached_property
     def _column(self) -> Int64s:
@@ -377,17 +375,11 @@ def _entropy_bits(probability: Float64s) -> Float64s:
     return np.where(total > 0, bits / np.where(total > 0, total, 1.0), np.nan)
 
 
-def _padded(
-    pool: DetectionTrack, index: list[list[Int64s]], num_columns: int, origins_ns: Int64s, datum_m: Float64s
-) -> Detections:
-    """Detections of the pool laid out as [R, C, N], about each row's origin and datum."""
+def _picked(index: list[list[Int64s]], num_columns: int) -> Int64s:
+    """Lists of detections by row and column as one array [R, C, N], -1 for padding."""
     num = max((len(rows) for columns in index for rows in columns), default=1)
     pick = np.full((len(index), num_columns, max(num, 1)), -1)
     for r, columns in enumerate(index):
         for c, rows in enumerate(columns):
             pick[r, c, : len(rows)] = rows
-    is_observed: Bools = pick >= 0
-    time_s = np.where(is_observed, (pool.time_ns[pick] - origins_ns[:, None, None]) * 1e-9, 0.0)
-    position_m = np.where(is_observed[..., None], pool.position_m[pick] - datum_m[:, None, None], 0.0)
-    covariance_m2 = np.where(is_observed[..., None, None], pool.covariance_m2[pick], np.eye(2))
-    return Detections(*(torch.from_numpy(value) for value in (time_s, position_m, covariance_m2, is_observed)))
+    return pick

@@ -4,14 +4,12 @@ Inside a window time is seconds relative to its origin and space metres relative
 float64 mission coordinates end here.
 """
 
-import itertools
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 import torch
 from torch import Tensor
 
@@ -19,10 +17,7 @@ from cadence.constraints.obstacles import Obstacles
 from cadence.errors import ConfigError, InputError
 from cadence.types import Context, Detections, WindowBatch
 from pipeline.arrays import Bools, Float64s, Int64s
-
-UNKNOWN_AGENT = "unknown"
-"""Name of the one agent that detections of unknown origin are taken to belong to where they are not told apart
-(`pipeline.associations` does that)."""
+from pipeline.tracks import DetectionTrack, agent_tracks, interpolated
 
 _NICE = np.array([1.0, 1.2, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0])
 _STEPS_PER_GAP = 16.0
@@ -110,22 +105,6 @@ class MissionWindows:
         return replace(self, batch=self.batch.with_context(context))
 
 
-@dataclass(frozen=True, eq=False)
-class DetectionTrack:
-    """N detections of one agent, or of one stream, sorted by time: time_ns [N], position_m [N, 2], covariance_m2 [N, 2, 2]."""
-
-    time_ns: Int64s
-    position_m: Float64s
-    covariance_m2: Float64s
-
-    def __getitem__(self, rows: slice | Int64s | Bools) -> "DetectionTrack":
-        """A selection of the detections."""
-        return DetectionTrack(self.time_ns[rows], self.position_m[rows], self.covariance_m2[rows])
-
-    def __len__(self) -> int:
-        return len(self.time_ns)
-
-
 def plan_grid(detections: pa.Table, config: GridConfig) -> Grid:
     """The grid for a DETECTIONS table: the step from the gaps unless configured, origins from first to last detection."""
     if detections.num_rows == 0:
@@ -166,19 +145,20 @@ def build_windows(detections: pa.Table, grid: Grid, seed: int, default_sigma_m: 
     `default_sigma_m` is the accuracy of detections without covariance (the estimators add their own small floor).
     """
     tracks = kept_tracks(detections, grid, default_sigma_m)
-    columns = _slice_tracks(tracks, grid.origins_ns, grid.origins_ns - grid.context_ns, grid.origins_ns)
-    observed = columns.is_observed.numpy()
-    count = observed.sum(axis=(1, 2))
-    datum = columns.position_m.numpy().sum(axis=(1, 2)) / np.maximum(count, 1)[:, None]
-    batch = WindowBatch(grid.time_s, _about(columns, datum), window_seeds(seed, len(grid.origins_ns)), grid.origin_index)
-    return MissionWindows(batch, grid.origins_ns, grid.step_ns, tuple(tracks), datum)
+    pool = DetectionTrack.one_behind_the_other(tracks.values())
+    pick = _picked(tracks.values(), grid.origins_ns - grid.context_ns, grid.origins_ns)
+    datum_m = middle_m(pool, pick)
+    found = padded_detections(pool, pick, grid.origins_ns, datum_m)
+    batch = WindowBatch(grid.time_s, found, window_seeds(seed, len(grid.origins_ns)), grid.origin_index)
+    return MissionWindows(batch, grid.origins_ns, grid.step_ns, tuple(tracks), datum_m)
 
 
 def later_detections(detections: pa.Table, grid: Grid, windows: MissionWindows, default_sigma_m: float = 0.0) -> Detections:
     """What was detected after each window's origin and within its horizon, relative to origin and datum like the window."""
     end = grid.origins_ns + grid.horizon_steps * grid.step_ns
-    tracks = kept_tracks(detections, grid, default_sigma_m)
-    return _about(_slice_tracks(tracks, grid.origins_ns, grid.origins_ns, end), windows.datum_m)
+    tracks = kept_tracks(detections, grid, default_sigma_m).values()
+    pool, pick = DetectionTrack.one_behind_the_other(tracks), _picked(tracks, grid.origins_ns, end)
+    return padded_detections(pool, pick, grid.origins_ns, windows.datum_m)
 
 
 def kept_tracks(detections: pa.Table, grid: Grid, default_sigma_m: float) -> dict[str, DetectionTrack]:
@@ -186,33 +166,33 @@ def kept_tracks(detections: pa.Table, grid: Grid, default_sigma_m: float) -> dic
     return {agent: _one_per_cell(track, grid) for agent, track in agent_tracks(detections, default_sigma_m)}
 
 
-def _about(detections: Detections, datum_m: Float64s) -> Detections:
-    """Positions relative to each window's datum; padding at the datum."""
-    datum = torch.from_numpy(datum_m)[:, None, None]
-    position = torch.where(detections.is_observed[..., None], detections.position_m - datum, 0.0)
-    return Detections(detections.time_s, position, detections.covariance_m2, detections.is_observed)
+def _picked(tracks: Iterable[DetectionTrack], start_ns: Int64s, end_ns: Int64s) -> Int64s:
+    """Which detections of the tracks, one behind the other, lie in (start, end] of each of B windows [B, A, N]; -1: padding."""
+    begin, end, offset = [], [], 0
+    for track in tracks:
+        begin.append(offset + np.searchsorted(track.time_ns, start_ns, "right"))
+        end.append(offset + np.searchsorted(track.time_ns, end_ns, "right"))
+        offset += len(track)
+    first, stop = np.stack(begin, axis=1)[..., None], np.stack(end, axis=1)[..., None]
+    pick = first + np.arange(max(1, int((stop - first).max())))
+    return np.where(pick < stop, pick, -1)
 
 
-def _slice_tracks(tracks: dict[str, DetectionTrack], origins_ns: Int64s, start_ns: Int64s, end_ns: Int64s) -> Detections:
-    """Detections of each agent in (start, end] of each window, padded [B, A, N]; positions still in the mission frame."""
-    spans = {
-        agent: (np.searchsorted(t.time_ns, start_ns, "right"), np.searchsorted(t.time_ns, end_ns, "right"))
-        for agent, t in tracks.items()
-    }
-    b, a = len(origins_ns), len(tracks)
-    n = max(1, max(int((end - begin).max()) for begin, end in spans.values()))
-    time_s, position = np.zeros((b, a, n)), np.zeros((b, a, n, 2))
-    covariance = np.zeros((b, a, n, 2, 2)) + np.eye(2)
-    observed = np.zeros((b, a, n), dtype=bool)
-    for index, (agent, track) in enumerate(tracks.items()):
-        begin, end = spans[agent]
-        row, column = np.nonzero(np.arange(n) < (end - begin)[:, None])
-        source = begin[row] + column
-        observed[row, index, column] = True
-        time_s[row, index, column] = (track.time_ns[source] - origins_ns[row]) * 1e-9
-        position[row, index, column] = track.position_m[source]
-        covariance[row, index, column] = track.covariance_m2[source]
-    return Detections(*(torch.from_numpy(value) for value in (time_s, position, covariance, observed)))
+def middle_m(pool: DetectionTrack, pick: Int64s) -> Float64s:
+    """The mean position [R, 2] of the picked detections [R, C, N]; the origin where there are none."""
+    is_observed = pick >= 0
+    total = np.where(is_observed[..., None], pool.position_m[pick], 0.0).sum(axis=(1, 2))
+    middle: Float64s = total / np.maximum(is_observed.sum(axis=(1, 2)), 1)[:, None]
+    return middle
+
+
+def padded_detections(pool: DetectionTrack, pick: Int64s, origins_ns: Int64s, datum_m: Float64s) -> Detections:
+    """The picked detections [R, C, N] of a pool, -1 for padding, about the origin [R] and the datum [R, 2] of each row."""
+    is_observed: Bools = pick >= 0
+    time_s = np.where(is_observed, (pool.time_ns[pick] - origins_ns[:, None, None]) * 1e-9, 0.0)
+    position_m = np.where(is_observed[..., None], pool.position_m[pick] - datum_m[:, None, None], 0.0)
+    covariance_m2 = np.where(is_observed[..., None, None], pool.covariance_m2[pick], np.eye(2))
+    return Detections(*(torch.from_numpy(value) for value in (time_s, position_m, covariance_m2, is_observed)))
 
 
 def window_seeds(seed: int, num_windows: int) -> Tensor:
@@ -226,76 +206,39 @@ def fit_tracks(detections: pa.Table, grid: Grid, default_sigma_m: float = 0.0) -
 
     Times are seconds since the first detection of the stretch, positions metres relative to it.
     """
-    length_ns = grid.context_ns
-    pieces: list[DetectionTrack] = []
-    for _, track in agent_tracks(detections, default_sigma_m):
-        kept = _one_per_cell(track, grid)
-        cell = (kept.time_ns - kept.time_ns[0]) // length_ns
-        cuts = np.flatnonzero(np.diff(cell)) + 1
-        bounds = [0, *cuts.tolist(), len(cell)]
-        for begin, end in itertools.pairwise(bounds):
-            pieces.append(kept[begin:end])
-    n = max(len(piece.time_ns) for piece in pieces)
-    r = len(pieces)
-    time_s, position = np.zeros((r, 1, n)), np.zeros((r, 1, n, 2))
-    covariance, observed = np.zeros((r, 1, n, 2, 2)) + np.eye(2), np.zeros((r, 1, n), dtype=bool)
-    for row, piece in enumerate(pieces):
-        m = len(piece.time_ns)
-        time_s[row, 0, :m] = (piece.time_ns - piece.time_ns[0]) * 1e-9
-        position[row, 0, :m] = piece.position_m - piece.position_m[0]
-        covariance[row, 0, :m] = piece.covariance_m2
-        observed[row, 0, :m] = True
-    return Detections(*(torch.from_numpy(value) for value in (time_s, position, covariance, observed)))
+    tracks = kept_tracks(detections, grid, default_sigma_m).values()
+    bounds, offset = [0], 0
+    for track in tracks:
+        cell = (track.time_ns - track.time_ns[0]) // grid.context_ns
+        bounds += (offset + np.flatnonzero(np.diff(cell)) + 1).tolist()
+        offset += len(track)
+        bounds.append(offset)
+    first, stop = np.array(bounds[:-1]), np.array(bounds[1:])
+    place = first[:, None, None] + np.arange((stop - first).max())
+    pool = DetectionTrack.one_behind_the_other(tracks)
+    pick = np.where(place < stop[:, None, None], place, -1)
+    return padded_detections(pool, pick, pool.time_ns[first], pool.position_m[first])
 
 
 def truth_on_grid(truth: pa.Table, windows: MissionWindows, max_gap_s: float) -> tuple[Tensor, Tensor]:
     """Truth at every step: positions [B, A, T, 2] relative to the datum, and where they are known [B, A, T].
 
-    Linear between the enclosing truth samples; unknown where these lie more than `max_gap_s` apart.
+    See `interpolated`; unknown between samples that lie more than `max_gap_s` apart.
     """
     step_times = windows.origins_ns[:, None] + np.round(windows.batch.time_s.numpy() * 1e9).astype(np.int64)
     position = np.full((*step_times.shape[:1], len(windows.agent_ids), step_times.shape[1], 2), np.nan)
     tracks = dict(agent_tracks(truth, 0.0))
     for index, agent in enumerate(windows.agent_ids):
         if agent in tracks:
-            found, is_known = interpolated(tracks[agent], step_times, max_gap_s)
-            position[:, index] = np.where(is_known[..., None], found - windows.datum_m[:, None], np.nan)
+            track = tracks[agent]
+            found = interpolated(track.time_ns, track.position_m, step_times, max_gap_s * 1e9)
+            position[:, index] = found - windows.datum_m[:, None]
     is_known_everywhere = np.isfinite(position[..., 0])
     return torch.from_numpy(np.nan_to_num(position)), torch.from_numpy(is_known_everywhere)
 
 
-def interpolated(track: DetectionTrack, time_ns: Int64s, max_gap_s: float) -> tuple[Float64s, Bools]:
-    """Positions [..., 2] of a track at any times [...], and where they are known: between samples at most so far apart."""
-    at = np.clip(np.searchsorted(track.time_ns, time_ns), 1, max(len(track.time_ns) - 1, 1))
-    later = np.minimum(at, len(track.time_ns) - 1)
-    before, after = track.time_ns[at - 1], track.time_ns[later]
-    is_known = (before <= time_ns) & (time_ns <= after) & (after - before <= max_gap_s * 1e9)
-    share = (time_ns - before) / np.maximum(after - before, 1)
-    first, second = track.position_m[at - 1], track.position_m[later]
-    return first + share[..., None] * (second - first), is_known
-
-
 def _times_by_agent(table: pa.Table) -> list[Int64s]:
     return [track.time_ns for _, track in agent_tracks(table, 0.0)]
-
-
-def agent_tracks(table: pa.Table, default_sigma_m: float) -> Iterator[tuple[str, DetectionTrack]]:
-    """Agents in the order of their names, each sorted by time."""
-    agent = pc.fill_null(table["agent_id"], UNKNOWN_AGENT)
-    for name in sorted(pc.unique(agent).to_pylist()):
-        yield name, track_of(table.filter(pc.equal(agent, name)).sort_by("time_ns"), default_sigma_m)
-
-
-def track_of(rows: pa.Table, default_sigma_m: float) -> DetectionTrack:
-    """All rows of a table that is sorted by time, whoever caused them."""
-    position = np.stack([rows["x_m"].to_numpy(), rows["y_m"].to_numpy()], axis=-1)
-    covariance = np.zeros((len(position), 2, 2)) + default_sigma_m**2 * np.eye(2)
-    if "cov_xx_m2" in rows.column_names:
-        xx, xy, yy = (rows[f"cov_{axis}_m2"].to_numpy() for axis in ("xx", "xy", "yy"))
-        given = np.isfinite(xx.astype(np.float64)) & np.isfinite(yy.astype(np.float64))
-        stacked = np.stack([xx, np.nan_to_num(xy), np.nan_to_num(xy), yy], axis=-1).astype(np.float64).reshape(-1, 2, 2)
-        covariance[given] = stacked[given]
-    return DetectionTrack(rows["time_ns"].to_numpy(), position, covariance)
 
 
 def _one_per_cell(track: DetectionTrack, grid: Grid) -> DetectionTrack:

@@ -26,7 +26,7 @@ FLOORS = {
     "pipeline": (
         {"arrays", "config", "locks", "progress", "provenance", "plain_rows", "obstacle_file"},
         {"manifest", "tables"},
-        {"frames", "stores", "logs", "mapping"},
+        {"frames", "stores", "logs", "mapping", "tracks"},
         {"missions", "checkpoints", "windows", "results"},
         {"catalogue", "associations"},
         {"estimators"},

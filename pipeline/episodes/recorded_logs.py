@@ -20,7 +20,7 @@ from pipeline.mapping.guess import suggest_mapping
 from pipeline.obstacle_file import OBSTACLES_NAME
 from pipeline.progress import Progress
 from pipeline.tables import read_table
-from pipeline.windows import UNKNOWN_AGENT
+from pipeline.tracks import UNKNOWN_AGENT, interpolated
 
 GOAL_KEYS = ("known_goal_m", "hideout_known_to_trackers")
 """Keys of a log's Metadata record `mission` that hold [x, y] or a list of them, metres: where the searching side expects it."""
@@ -166,7 +166,7 @@ def _episode(
     num_steps = int((time_ns[-1] - time_ns[0] + _JITTER * step_ns) // step_ns) + 1
     steps_ns = np.minimum(time_ns[0] + step_ns * np.arange(num_steps, dtype=np.int64), time_ns[-1])
     max_gap_ns = gridding.max_gap_steps * step_ns
-    position = _interpolated(steps_ns, time_ns, place, max_gap_ns)
+    position = interpolated(time_ns, place, steps_ns, max_gap_ns)
     if np.isnan(position).any():
         widest = float(np.diff(time_ns).max(initial=0)) * 1e-9
         raise InputError(f"{path}: truth has a gap of {widest:g} s, more than {max_gap_ns * 1e-9:g} s; raise max_gap_steps")
@@ -183,17 +183,6 @@ def _episode(
     )
 
 
-def _interpolated(at_ns: Int64s, time_ns: Int64s, place: Float64s, max_gap_ns: float) -> Float64s:
-    """Positions [T, 2] at the times asked for, NaN outside the samples and in gaps that are too long."""
-    after = np.clip(np.searchsorted(time_ns, at_ns), 0, len(time_ns) - 1)
-    is_exact = time_ns[after] == at_ns
-    before = np.where(is_exact, after, np.maximum(after - 1, 0))
-    span = time_ns[after] - time_ns[before]
-    is_known = is_exact | ((time_ns[before] < at_ns) & (at_ns < time_ns[after]) & (span <= max_gap_ns))
-    share = (at_ns - time_ns[before]) / np.maximum(span, 1)
-    return np.where(is_known[:, None], place[before] + share[:, None] * (place[after] - place[before]), np.nan)
-
-
 def _seen_steps(
     path: Path, seen: pa.Table, truth: tuple[Int64s, Float64s], step_ns: int, num_steps: int, tolerance_m: float
 ) -> Int64s:
@@ -202,7 +191,7 @@ def _seen_steps(
     at = seen["time_ns"].to_numpy()
     step = np.ceil((at - time_ns[0]) / step_ns - _JITTER).astype(np.int64)
     is_inside = (at >= time_ns[0]) & (step < num_steps)
-    off_m = np.hypot(*(_places(seen) - _interpolated(at, time_ns, place, np.inf)).T)[is_inside]
+    off_m = np.hypot(*(_places(seen) - interpolated(time_ns, place, at, np.inf)).T)[is_inside]
     is_far = ~(off_m <= tolerance_m)
     if is_far.sum() > _OFF_TRUTH_SHARE * len(off_m):
         raise InputError(
@@ -234,7 +223,7 @@ def _trackers(poses: pa.Table | None, steps_ns: Int64s, target: Float64s, max_ga
     for sensor in sensors:
         assert poses is not None
         rows = poses.filter(pc.equal(poses["sensor_id"], sensor)).sort_by("time_ns")
-        track = _interpolated(steps_ns, rows["time_ns"].to_numpy(), _places(rows), max_gap_ns)
+        track = interpolated(rows["time_ns"].to_numpy(), _places(rows), steps_ns, max_gap_ns)
         own_pace = _typical_step(track)
         if own_pace > 0:
             tracks.append((own_pace <= _AIRCRAFT_FACTOR * pace, track))

@@ -10,7 +10,8 @@ from torch import Tensor
 
 from cadence.types import Detections, HypothesisSet, WindowBatch
 from pipeline.arrays import Float64s
-from pipeline.windows import MissionWindows, agent_tracks, interpolated
+from pipeline.tracks import agent_tracks, interpolated
+from pipeline.windows import MissionWindows
 
 _LEAST_SHARE = 0.5
 
@@ -40,9 +41,9 @@ def _gains(windows: MissionWindows, truth: pa.Table, names: tuple[str, ...], max
     tracks = dict(agent_tracks(truth, 0.0))
     gain = np.zeros((*time_ns.shape[:2], len(names)))
     for index, name in enumerate(names):
-        true_m, is_known = interpolated(tracks[name], time_ns, max_gap_s)
+        true_m = interpolated(tracks[name].time_ns, tracks[name].position_m, time_ns, max_gap_s * 1e9)
         near = np.clip(1.0 - np.linalg.norm(position_m - true_m, axis=-1) / reach_m, 0.0, 1.0)
-        gain[..., index] = np.where(is_known & found.is_observed.numpy(), near, 0.0).sum(-1)
+        gain[..., index] = np.where(found.is_observed.numpy(), np.nan_to_num(near), 0.0).sum(-1)
     return gain
 
 

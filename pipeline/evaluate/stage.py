@@ -34,7 +34,8 @@ from pipeline.obstacle_file import OBSTACLES_NAME, read_obstacles
 from pipeline.progress import Progress
 from pipeline.results import MissionHypotheses, read_hypothesis_tables
 from pipeline.tables import read_table
-from pipeline.windows import UNKNOWN_AGENT, Grid, MissionWindows, build_windows, truth_on_grid
+from pipeline.tracks import UNKNOWN_AGENT
+from pipeline.windows import Grid, MissionWindows, build_windows, truth_on_grid
 
 LABELS_NAME = "labels.parquet"
 _TRUTH_GAP_STEPS = 2.0

@@ -14,6 +14,7 @@ from pipeline.export.playback import LiveAgent, Scene
 from pipeline.frames import to_geodetic
 from pipeline.logs.writer import foxglove_class
 from pipeline.tables import Frame
+from pipeline.tracks import UNKNOWN_AGENT
 
 _APPROXIMATED, _KNOWN = 1, 3  # foxglove.LocationFix.PositionCovarianceType
 _REGION_STEPS = 24
@@ -34,7 +35,7 @@ def encode_detection_fix(row: dict[str, Any], frame: Frame, style: Style, time_n
     is_known = xx is not None and yy is not None
     covariance = np.array([[xx, xy or 0.0], [xy or 0.0, yy]]) if is_known else None
     position_m, z_m = np.array([row["x_m"], row["y_m"]]), row["z_m"] if row["z_m"] is not None else style.z_m
-    color = style.color(row["agent_id"] or "unknown")
+    color = style.color(row["agent_id"] or UNKNOWN_AGENT)
     return _encode_fix(position_m, z_m, covariance, frame, color, time_ns, _KNOWN if is_known else 0)
 
 

@@ -29,12 +29,12 @@ from pipeline.progress import Progress
 from pipeline.provenance import versions
 from pipeline.results import MissionHypotheses, read_hypothesis_tables
 from pipeline.tables import read_table
+from pipeline.tracks import UNKNOWN_AGENT
 from schemas import channels
 from schemas.channels import Channel
 
 _TABLES = ("hypotheses.parquet", "windows.parquet", "detections.parquet")
 _EARLIER_STAGES = ("ingest", "extract", "infer")
-_UNKNOWN_AGENT_ID = "unknown"
 _VERTICES, _VERTICES_OF_SHORT_SCENES = 32, 15
 _SHORT_SCENE_TICKS = 3
 _CLOCK_TOLERANCE_NS = 10 * 1_000_000_000
@@ -213,7 +213,7 @@ def _tick_ns(scenes: list[Scene], config: ExportConfig) -> int:
 
 
 def _marks(detections: pa.Table) -> tuple[Marks, ...]:
-    agent = np.array([name or _UNKNOWN_AGENT_ID for name in detections["agent_id"].to_pylist()], dtype=object)
+    agent = np.array([name or UNKNOWN_AGENT for name in detections["agent_id"].to_pylist()], dtype=object)
     time_ns = detections["time_ns"].to_numpy()
     position_m = _positions(detections)
     usable = np.isfinite(position_m).all(axis=-1)

@@ -10,12 +10,16 @@ import numpy as np
 
 from pipeline.arrays import Bools, Float64s, Int64s
 from pipeline.report.mission import Fan, Mission, Points, WindowRow
+from pipeline.tracks import interpolated
 
 LEVELS = (0.5, 0.9)
 """Shares of the weight that the two envelopes hold."""
 
 SMALL_M2 = 1e-6
 """Added to variances (1 mm²): exact detections leave no spread, and a point must still have an inside."""
+
+_GAP_FACTOR = 3.0
+"""Truth is not interpolated in gaps of over so many times its median interval."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,18 +77,10 @@ class TruthScore:
 
 
 def interpolate_truth(truth: Points, time_ns: Int64s) -> Float64s:
-    """Truth of one agent at `time_ns` [T, 2]; NaN outside it and inside gaps of over three times its median interval."""
-    position_m = np.full((len(time_ns), 2), np.nan)
+    """Truth of one agent at `time_ns` [T, 2]; NaN outside it, inside wide gaps, and where there is but one point."""
     if len(truth) < 2:
-        return position_m
-    gaps = np.diff(truth.time_ns)
-    following = np.clip(np.searchsorted(truth.time_ns, time_ns, side="right"), 1, len(truth) - 1)
-    gap = gaps[following - 1]
-    usable = (time_ns >= truth.time_ns[0]) & (time_ns <= truth.time_ns[-1]) & (gap > 0) & (gap <= 3 * np.median(gaps))
-    share = (time_ns - truth.time_ns[following - 1])[usable] / gap[usable]
-    before, after = truth.position_m[following - 1][usable], truth.position_m[following][usable]
-    position_m[usable] = before + share[:, None] * (after - before)
-    return position_m
+        return np.full((len(time_ns), 2), np.nan)
+    return interpolated(truth.time_ns, truth.position_m, time_ns, _GAP_FACTOR * float(np.median(np.diff(truth.time_ns))))
 
 
 def truth_errors(fan: Fan, shape: FanShape, truth: Points) -> tuple[Float64s, Bools]:

@@ -21,11 +21,9 @@ from pipeline.obstacle_file import OBSTACLES_NAME, read_obstacle_entries
 from pipeline.report.origins import Origins, origins_of, with_likeliest
 from pipeline.results import AgentHypotheses, MissionHypotheses, WindowHypotheses, read_hypothesis_tables
 from pipeline.tables import Frame, read_table
+from pipeline.tracks import UNKNOWN_AGENT
 
 JsonDict = dict[str, Any]
-
-UNKNOWN_AGENT = "unknown"
-"""The agent to which infer gives detections of unknown origin (`pipeline.windows`, whose import would load torch)."""
 
 STAGES = ("ingest", "extract", "infer", "export", "evaluate")
 """Stages whose manifests the page shows, in the order of the work."""

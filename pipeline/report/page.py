@@ -11,7 +11,7 @@ from pipeline.report.analysis import Analysis, Moment, share_of_steps
 from pipeline.report.clock import Clock, duration
 from pipeline.report.health import health_section
 from pipeline.report.markup import inline_json, legend, section, text
-from pipeline.report.mission import UNKNOWN_AGENT, Mission
+from pipeline.report.mission import Mission
 from pipeline.report.origins import origins_section
 from pipeline.report.payload import Payload
 from pipeline.report.provenance import provenance_section
@@ -19,6 +19,7 @@ from pipeline.report.sections import moments_section, trouble_section, uncertain
 from pipeline.report.suspicions import suspicions_section
 from pipeline.report.truth import truth_section
 from pipeline.tables import Frame
+from pipeline.tracks import UNKNOWN_AGENT
 
 READING = (
     "A hypothesis is one complete, plausible story of where every agent was between its detections and where it may go next; "

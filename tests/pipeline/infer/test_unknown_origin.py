@@ -38,7 +38,8 @@ from pipeline.progress import Progress
 from pipeline.report.stage import ReportConfig, report
 from pipeline.results import read_hypothesis_tables
 from pipeline.tables import Frame, read_table, write_table
-from pipeline.windows import UNKNOWN_AGENT, GridConfig
+from pipeline.tracks import UNKNOWN_AGENT
+from pipeline.windows import GridConfig
 from schemas.channels import message_class
 from schemas.tables import ASSOCIATIONS, LABELS
 
