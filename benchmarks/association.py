@@ -33,7 +33,7 @@ from cadence.association.types import CLUTTER, AssociationConfig, agent_probabil
 from cadence.bank.bank import Bank
 from cadence.metrics import Interval, bootstrap_mean
 from cadence.types import Detections, WindowBatch
-from pipeline.manifest import write_atomic
+from pipeline.files import write_atomic
 
 WORK = Path("out/benchmarks/association")
 NUM_WAYS = 12

@@ -19,7 +19,7 @@ from rts_smoother import rts_smoothed
 
 from cadence.arrays import Float64s
 from cadence.association.types import CLUTTER
-from pipeline.manifest import write_atomic
+from pipeline.files import write_atomic
 
 KINDS = ("GNN", "JPDA")
 NUM_SAMPLES = 60

@@ -20,7 +20,7 @@ from cadence.recordings import ForecastWindows, cut_windows
 from cadence.worlds.rendezvous import RendezvousConfig, simulate_rendezvous_batch
 from pipeline.checkpoints import find_checkpoint
 from pipeline.estimators.scene import load_scene
-from pipeline.manifest import write_atomic
+from pipeline.files import write_atomic
 
 AGENTS = (1, 2, 4, 8, 16, 32)
 NUM_HYPOTHESES = 30

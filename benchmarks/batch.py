@@ -22,7 +22,7 @@ from pipeline.batch.run import run
 from pipeline.checkpoints import checkpoint_hash, find_checkpoint
 from pipeline.config import stage_config
 from pipeline.estimators.scene import load_scene, scene_grid
-from pipeline.manifest import hash_file, write_atomic
+from pipeline.files import hash_file, write_atomic
 from pipeline.progress import Progress
 from pipeline.provenance import versions
 from pipeline.simulate.stage import SimulateConfig, simulate

@@ -17,7 +17,7 @@ from pipeline.batch.config import RunConfig
 from pipeline.batch.outcome import LogOutcome, exit_code
 from pipeline.batch.run import run
 from pipeline.config import stage_config
-from pipeline.manifest import hash_file, write_atomic
+from pipeline.files import hash_file, write_atomic
 from pipeline.progress import Progress
 from pipeline.provenance import versions
 from pipeline.simulate.stage import SimulateConfig, simulate

@@ -25,7 +25,7 @@ from cadence.training.loop import OptimiserConfig
 from cadence.types import Context
 from cadence.worlds.patrol import PatrolConfig, simulate_patrol
 from pipeline.estimators.paper import load_absolute
-from pipeline.manifest import write_atomic
+from pipeline.files import write_atomic
 from pipeline.progress import Progress
 from pipeline.train.config import AbsoluteTraining, TrainConfig
 from pipeline.train.missions import mission_of_episode

@@ -23,12 +23,12 @@ from cadence.types import Detections, Estimator, HypothesisSet, WindowBatch
 from pipeline.checkpoints import checkpoint_hash, find_checkpoint
 from pipeline.episodes.recordings import RecordingsConfig, RecordingSet, load_recordings
 from pipeline.estimators.scene import load_scene
+from pipeline.files import write_atomic
 from pipeline.forecast.leads import relative_lead
 from pipeline.forecast.rivals import FORECAST_RIVALS
 from pipeline.forecast.scores import HORIZONS, EpisodeScores
 from pipeline.forecast.stage import ForecastConfig, ForecastRun, forecast_windows
 from pipeline.forecast.tables import line, mean_interval, number, with_interval
-from pipeline.manifest import write_atomic
 from pipeline.progress import Progress
 
 FIRST_TRACK = 500

@@ -282,7 +282,7 @@ def main() -> int:
         memory = memory_lines(folder, arguments.memory_sizes_mb)  # first: children must not start with our peak
         bombs = bomb_lines(folder)
         from benchmarks.mixed_logs import write_mixed_log
-        from pipeline.manifest import write_atomic
+        from pipeline.files import write_atomic
         from pipeline.provenance import versions
 
         path = folder / "mixed.mcap"

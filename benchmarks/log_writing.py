@@ -29,10 +29,10 @@ from pipeline.export.messages import encode_agents, encode_hypotheses
 from pipeline.export.playback import Scene, build_scenes, plan_ticks
 from pipeline.export.scene import Entity, encode_scene
 from pipeline.export.stage import ExportConfig, num_vertices
+from pipeline.files import write_atomic
 from pipeline.logs.append import write_combined
 from pipeline.logs.recorder import Packing
 from pipeline.logs.writer import LogWriter, schema_bytes
-from pipeline.manifest import write_atomic
 from pipeline.progress import Progress
 from pipeline.provenance import versions
 from pipeline.results import AgentHypotheses, MissionHypotheses, WindowHypotheses

@@ -91,7 +91,7 @@ def main() -> int:
     text += f"\nUnder {LIMIT_GB:g} GB: {'holds' if holds else 'does not hold'}.\n"
     sys.stdout.write(text)
     if arguments.publish is not None:
-        from pipeline.manifest import write_atomic
+        from pipeline.files import write_atomic
 
         write_atomic(arguments.publish / "many_agents.md", text)
     return 0 if holds else 1

@@ -98,7 +98,7 @@ def main() -> int:
     lines, holds = rows()
     # only now: these bring torch with them, and this process has to be small while children start
     from pipeline.checkpoints import DEFAULT, checkpoint_hash, find_checkpoint
-    from pipeline.manifest import write_atomic
+    from pipeline.files import write_atomic
     from pipeline.provenance import versions
 
     made_with = ", ".join(f"{name} {number}" for name, number in versions().items())

@@ -31,12 +31,12 @@ from pipeline.checkpoints import checkpoint_hash, find_checkpoint
 from pipeline.episodes.recordings import RecordingsConfig, load_recordings
 from pipeline.estimators.presets import load_forecaster
 from pipeline.estimators.samplings import Samplings
+from pipeline.files import write_atomic
 from pipeline.forecast.leads import relative_lead
 from pipeline.forecast.rivals import FORECAST_RIVALS
 from pipeline.forecast.scores import HORIZONS, EpisodeScores
 from pipeline.forecast.stage import ForecastConfig, ForecastRun, forecast_windows
 from pipeline.forecast.tables import TITLES, line, with_interval
-from pipeline.manifest import write_atomic
 from pipeline.progress import Progress
 
 SETS = ("low", "high")

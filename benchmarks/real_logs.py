@@ -28,8 +28,8 @@ from pipeline.evaluate.scores import METRICS, PARTS, Cells, compare, groups_of
 from pipeline.evaluate.stage import default_truth_gap_s
 from pipeline.extract.stage import ExtractConfig, extract
 from pipeline.extract.thinning import ThinningConfig
+from pipeline.files import write_atomic
 from pipeline.ingest.stage import IngestConfig, ingest
-from pipeline.manifest import write_atomic
 from pipeline.mapping.sources import SourceConfig
 from pipeline.progress import Progress
 from pipeline.tables import read_table

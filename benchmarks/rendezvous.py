@@ -37,7 +37,7 @@ from cadence.worlds.rendezvous import RendezvousConfig, simulate_rendezvous, sim
 from cadence.worlds.rendezvous_map import GOALS_M, SITES_M
 from pipeline.checkpoints import checkpoint_hash, find_checkpoint
 from pipeline.estimators.scene import load_scene
-from pipeline.manifest import write_atomic
+from pipeline.files import write_atomic
 from pipeline.provenance import versions
 
 HORIZONS = (0, 29, 59, 89, 119)

@@ -41,8 +41,8 @@ from pipeline.checkpoints import checkpoint_hash, find_checkpoint
 from pipeline.estimators.fitting import FittingData
 from pipeline.estimators.presets import load_estimator
 from pipeline.estimators.samplings import GeneralSampling, Samplings
+from pipeline.files import write_atomic
 from pipeline.infer.draws import draw_windows
-from pipeline.manifest import write_atomic
 from pipeline.provenance import versions
 from pipeline.train.missions import mission_of_episode
 from pipeline.windows import GridConfig, MissionWindows, build_windows, plan_grid, truth_on_grid

@@ -34,11 +34,11 @@ from pipeline.checkpoints import checkpoint_hash, read_info
 from pipeline.episodes.pool import EpisodePool, EpisodeSource
 from pipeline.episodes.recordings import RecordingsConfig, load_recordings, read_recordings
 from pipeline.estimators.scene import load_scene
+from pipeline.files import write_atomic
 from pipeline.forecast.leads import averaged, relative_lead
 from pipeline.forecast.scores import HORIZONS, EpisodeScores
 from pipeline.forecast.stage import ForecastConfig, ForecastRun, forecast_windows
 from pipeline.forecast.tables import comparison, line, mean_interval, number, with_interval
-from pipeline.manifest import write_atomic
 from pipeline.progress import Progress
 from pipeline.train.config import SceneTraining, TrainConfig
 from pipeline.train.scene import train_scene_network

@@ -45,8 +45,8 @@ from cadence.diffusion.scene import SceneModel, SceneSampling
 from cadence.metrics import Interval, bootstrap_ratio
 from cadence.recordings import ForecastWindows, Recordings, choose_windows
 from cadence.worlds import prison_map
+from pipeline.files import write_atomic
 from pipeline.forecast.scores import EpisodeScores
-from pipeline.manifest import write_atomic
 
 NEAR_CELLS = 250.0
 """A window is near where its true future comes this close to the mountain's centre."""

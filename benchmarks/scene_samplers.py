@@ -30,8 +30,8 @@ from cadence.worlds import prison_map
 from pipeline.checkpoints import checkpoint_hash, find_checkpoint
 from pipeline.episodes.recordings import RecordingsConfig, load_recordings
 from pipeline.estimators.scene import load_scene
+from pipeline.files import write_atomic
 from pipeline.forecast.scores import HORIZONS, EpisodeScores, score_forecasts, step_quantiles
-from pipeline.manifest import write_atomic
 from pipeline.progress import Progress
 from pipeline.provenance import versions
 

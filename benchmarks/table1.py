@@ -40,10 +40,10 @@ from pipeline.config import config_as_dict
 from pipeline.episodes.recordings import RecordingsConfig, load_recordings
 from pipeline.estimators.presets import load_forecaster
 from pipeline.estimators.samplings import Samplings
+from pipeline.files import write_atomic
 from pipeline.forecast.leads import averaged
 from pipeline.forecast.rivals import FORECAST_RIVALS
 from pipeline.forecast.stage import ForecastConfig, ForecastRun, forecast_windows, truth_scores
-from pipeline.manifest import write_atomic
 from pipeline.progress import Progress
 
 EVALUATION_SEED, TRAINING_SEED = 2_000, 0

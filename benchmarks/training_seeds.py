@@ -33,11 +33,11 @@ from pipeline.episodes.pool import EpisodePool, EpisodeSource
 from pipeline.episodes.recordings import RecordingsConfig, load_recordings
 from pipeline.estimators.presets import load_forecaster
 from pipeline.estimators.samplings import Samplings
+from pipeline.files import write_atomic
 from pipeline.forecast.leads import averaged, count, relative_lead, verdicts
 from pipeline.forecast.scores import HORIZONS, EpisodeScores
 from pipeline.forecast.stage import ForecastConfig, ForecastRun, forecast_windows
 from pipeline.forecast.tables import TITLES, line, number, with_interval
-from pipeline.manifest import write_atomic
 from pipeline.progress import Progress
 from pipeline.train.config import TrainConfig
 from pipeline.train.rivals import train_rival

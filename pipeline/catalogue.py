@@ -12,9 +12,9 @@ from typing import Any, Final
 
 from cadence.errors import ConfigError, InputError
 from pipeline.config import read_config
+from pipeline.files import hash_file
 from pipeline.logs.parts import mission_name
 from pipeline.logs.reader import Health, MissionLog, reopen
-from pipeline.manifest import hash_file
 from pipeline.missions import CATALOGUE_NAME
 
 CATALOGUE_VERSION: Final = 1

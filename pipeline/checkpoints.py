@@ -3,20 +3,19 @@
 import dataclasses
 import functools
 import json
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from safetensors import SafetensorError
+from safetensors import SafetensorError, safe_open
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 import cadence
 from cadence.errors import ConfigError, DeviceError
 from pipeline.config import config_as_dict, read_config
-from pipeline.manifest import hash_file, write_atomic
+from pipeline.files import hash_file, replacing, write_atomic
 
 FORMAT = 1
 WEIGHTS_NAME = "checkpoint.safetensors"
@@ -55,14 +54,25 @@ def find_checkpoint(name: str) -> Path:
 
 def save_checkpoint(path: Path, network: nn.Module, info: CheckpointInfo) -> None:
     """Write weights and JSON; each atomically, the JSON last."""
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        partial = path.with_name(f".{path.name}.{os.getpid()}.part")
-        save_file({name: value.contiguous() for name, value in network.state_dict().items()}, partial)
-        os.replace(partial, path)
-    except (OSError, SafetensorError) as error:
-        raise DeviceError(f"{path}: cannot write the checkpoint ({error}); check the folder and the free space") from error
+    write_tensors(path, network.state_dict())
     write_atomic(path.with_suffix(".json"), json.dumps(config_as_dict(info), indent=1, sort_keys=True) + "\n")
+
+
+def write_tensors(path: Path, tensors: Mapping[str, Tensor], note: str | None = None) -> None:
+    """Write a safetensors file, whole or not at all; `read_note` finds what `note` says of it."""
+    with replacing(path) as draft:
+        try:
+            # one entry: several would stand in another order each time
+            metadata = None if note is None else {"note": note}
+            save_file({name: value.contiguous() for name, value in tensors.items()}, draft, metadata)
+        except SafetensorError as error:
+            raise DeviceError(f"{path}: cannot write ({error}); check the folder and the free space") from error
+
+
+def read_note(path: Path) -> str | None:
+    """What `write_tensors` was told of the file."""
+    with safe_open(path, "pt") as file:
+        return (file.metadata() or {}).get("note")
 
 
 def read_info(path: Path) -> CheckpointInfo:

@@ -4,21 +4,18 @@ A mission directory holds the files of one log, and one `<stage>.manifest.json` 
 the hashes of its inputs and outputs, the versions and a summary — enough to repeat the run, and to know that it need not be.
 """
 
-import contextlib
-import hashlib
 import itertools
 import json
 import os
-import secrets
-import shutil
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Literal
 
-from cadence.errors import DeviceError, InputError
+from cadence.errors import InputError
 from pipeline.config import config_as_dict
-from pipeline.locks import clear_abandoned, locked
+from pipeline.files import hash_file, working_folder, write_atomic
+from pipeline.locks import clear_abandoned
 from pipeline.provenance import versions
 
 JsonObject = Mapping[str, Any]
@@ -35,17 +32,6 @@ class StageResult:
     status: Literal["done", "skipped"]
     outputs: tuple[Path | str, ...]
     summary: JsonObject
-
-
-def hash_file(path: Path) -> str:
-    """SHA-256 of the content, read in blocks; `InputError` where the file is absent or cannot be read."""
-    try:
-        with path.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
-    except FileNotFoundError as error:
-        raise InputError(f"{path}: not found; check the path, or run the stage that writes it first") from error
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); check that it is a file and its permissions") from error
 
 
 def manifest_path(stage: str, directory: Path) -> Path:
@@ -92,7 +78,7 @@ def run_stage(
         skipped = _still_valid(stage, directory, earlier, key)
         if skipped is not None:
             return skipped
-    with _working_folder(stage, directory) as work:
+    with working_folder(directory, stage) as work:
         summary = body(work)
         names = sorted(path.name for path in work.iterdir())
         manifest = {**key, "outputs": {name: hash_file(work / name) for name in names}, "summary": dict(summary)}
@@ -131,17 +117,6 @@ def _digests(manifest: JsonObject | None, kind: str) -> Mapping[str, str]:
     return found if isinstance(found, dict) else {}
 
 
-def write_atomic(path: Path, text: str) -> None:
-    """Write a small text file so that readers see the old or the new content, never a part."""
-    clear_abandoned(path.parent, f".{path.name}.")
-    with _working_folder(path.name, path.parent) as work:
-        try:
-            (work / path.name).write_text(text, encoding="utf-8")
-            os.replace(work / path.name, path)
-        except OSError as error:
-            raise DeviceError(f"{path}: cannot write ({error.strerror}); check the folder and the free space") from error
-
-
 def _still_valid(stage: str, directory: Path, earlier: JsonObject, key: JsonObject) -> StageResult | None:
     """The earlier result where it was made from the same key and its files still have the content it had written."""
     outputs, summary = earlier.get("outputs"), earlier.get("summary")
@@ -152,27 +127,3 @@ def _still_valid(stage: str, directory: Path, earlier: JsonObject, key: JsonObje
     if any(not (directory / name).is_file() or hash_file(directory / name) != digest for name, digest in outputs.items()):
         return None
     return StageResult(stage, "skipped", tuple(directory / name for name in outputs), summary)
-
-
-@contextlib.contextmanager
-def _working_folder(stage: str, directory: Path) -> Iterator[Path]:
-    is_new = not directory.exists()
-    work = directory / f".{stage}.{secrets.token_hex(4)}"
-    try:  # begins before the folder is there, as a signal may end it at any moment
-        try:
-            directory.mkdir(parents=True, exist_ok=True)
-            work.mkdir(mode=0o700)
-        except OSError as error:
-            raise DeviceError(
-                f"{directory}: cannot write there ({error.strerror}); choose another folder with --out"
-            ) from error
-        try:
-            with locked(work):  # so that others know it from what a killed process left
-                yield work
-        except OSError as error:
-            raise DeviceError(f"{directory}: {stage} could not write its output ({error}); check the free space") from error
-    finally:
-        shutil.rmtree(work, ignore_errors=True)
-        if is_new:
-            with contextlib.suppress(OSError):  # the folder stays where it holds something
-                directory.rmdir()

@@ -9,7 +9,7 @@ from fixtures.line_logs import straight_line, write_log
 from mcap.reader import make_reader
 
 import cli
-from pipeline.manifest import hash_file
+from pipeline.files import hash_file
 
 ROOT = Path(__file__).resolve().parents[1]
 SHIPPED = sorted((ROOT / "cadence" / "checkpoints").glob("*.safetensors"))

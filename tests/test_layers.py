@@ -25,6 +25,7 @@ SOURCES = sorted(
 FLOORS = {
     "pipeline": (
         {"arrays", "config", "locks", "progress", "provenance", "plain_rows", "obstacle_file"},
+        {"files"},
         {"manifest", "tables"},
         {"frames", "stores", "logs", "mapping", "tracks"},
         {"missions", "checkpoints", "windows", "results"},

@@ -22,8 +22,9 @@ from cadence.errors import CadenceError, DeviceError
 from pipeline.batch.outcome import LogOutcome, LogTask
 from pipeline.batch.tasks import run_task
 from pipeline.config import config_as_dict
+from pipeline.files import hash_file, write_atomic
 from pipeline.locks import locked
-from pipeline.manifest import StageResult, hash_file, manifest_path, read_manifest, write_atomic
+from pipeline.manifest import StageResult, manifest_path, read_manifest
 from pipeline.progress import Progress
 from pipeline.provenance import versions
 from pipeline.stores.objects import StoredObject, describe, fetch, list_folder, read_bytes, remove, write_file

@@ -24,7 +24,8 @@ from pipeline.batch.remote import SOURCE_NAME, run_anywhere, write_text
 from pipeline.batch.summaries import batch_record, to_json
 from pipeline.batch.tasks import STAGES, Engine, plan_tasks, run_tasks
 from pipeline.catalogue import Catalogue, read_catalogue
-from pipeline.manifest import hash_file, manifest_path
+from pipeline.files import hash_file
+from pipeline.manifest import manifest_path
 from pipeline.missions import CATALOGUE_NAME, REPORT_NAME
 from pipeline.progress import Progress, Told
 from pipeline.stores.urls import is_url

@@ -6,7 +6,6 @@ that a killed call goes on where it was.
 
 import hashlib
 import json
-import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,12 +14,12 @@ from typing import Any, Literal
 import numpy as np
 
 from cadence.constraints.obstacles import Obstacles
-from cadence.errors import CadenceError, DeviceError, InputError
+from cadence.errors import CadenceError, InputError
 from cadence.recordings import Recordings
 from pipeline.config import config_as_dict
 from pipeline.episodes.recorded_logs import Gridding, LogEpisodes, read_log_episodes
 from pipeline.extract.stage import ExtractConfig
-from pipeline.manifest import hash_file
+from pipeline.files import hash_file, replacing
 from pipeline.obstacle_file import as_obstacles, obstacles_as_json
 from pipeline.progress import Progress
 from pipeline.provenance import versions
@@ -121,14 +120,8 @@ def save_recordings(path: Path, recordings: Recordings, **more: Any) -> None:
 
     `more` are further arrays: of those `load_recordings` knows scale_m and obstacles (the list of obstacles.json as text).
     """
-    partial = path.with_name(f".{path.name}.{os.getpid()}.part.npz")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        np.savez_compressed(partial, **vars(recordings), **more, format=FORMAT)
-        os.replace(partial, path)
-    except OSError as error:
-        partial.unlink(missing_ok=True)
-        raise DeviceError(f"{path}: cannot write ({error.strerror}); check the folder and the free space") from error
+    with replacing(path) as draft, draft.open("wb") as stream:
+        np.savez_compressed(stream, **vars(recordings), **more, format=FORMAT)
 
 
 def read_recordings(path: Path) -> tuple[Recordings, dict[str, Any]]:

@@ -27,8 +27,9 @@ from pipeline.evaluate.matching import match_to_truth, matched_windows
 from pipeline.evaluate.rivals import RIVALS
 from pipeline.evaluate.scores import Cells, Draw, IsInside, score_in_chunks
 from pipeline.evaluate.tables import OWN_NAME, ScoredMission, as_csv, as_json, as_markdown, headline, pool
+from pipeline.files import write_atomic
 from pipeline.forecast.stage import ForecastConfig, evaluate_forecasts
-from pipeline.manifest import StageResult, check_chain, read_manifest, run_stage, write_atomic
+from pipeline.manifest import StageResult, check_chain, read_manifest, run_stage
 from pipeline.missions import is_mission_directory
 from pipeline.obstacle_file import OBSTACLES_NAME, read_obstacles
 from pipeline.progress import Progress

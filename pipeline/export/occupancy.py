@@ -3,11 +3,9 @@
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from pipeline.arrays import Float64s
 from pipeline.export.playback import LiveAgent
-
-Float64s = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,10 +19,11 @@ from pipeline.export.display import Drawing, Marks, Style, draw, obstacle_entiti
 from pipeline.export.layouts import build_layout, build_legacy_layout
 from pipeline.export.playback import Scene, Tick, build_scenes, plan_ticks
 from pipeline.export.scene import encode_scene
+from pipeline.files import hash_file
 from pipeline.logs.append import write_combined
 from pipeline.logs.recorder import Compression, Packing
 from pipeline.logs.writer import LogWriter
-from pipeline.manifest import StageResult, hash_file, manifest_path, read_manifest, run_stage
+from pipeline.manifest import StageResult, manifest_path, read_manifest, run_stage
 from pipeline.missions import CATALOGUE_NAME
 from pipeline.obstacle_file import OBSTACLES_NAME, read_obstacle_entries
 from pipeline.progress import Progress

@@ -31,10 +31,11 @@ from pipeline.config import config_as_dict
 from pipeline.episodes.recordings import RecordingsConfig, RecordingSet, load_recordings
 from pipeline.estimators.presets import load_forecaster
 from pipeline.estimators.samplings import Samplings
+from pipeline.files import hash_file, write_atomic
 from pipeline.forecast.rivals import FORECAST_RIVALS, label_of
 from pipeline.forecast.scores import HORIZONS, EpisodeScores, score_forecasts
 from pipeline.forecast.tables import ForecastFacts, as_csv, as_json, as_markdown, headline, pool
-from pipeline.manifest import StageResult, hash_file, run_stage, write_atomic
+from pipeline.manifest import StageResult, run_stage
 from pipeline.progress import Progress
 from pipeline.provenance import versions
 

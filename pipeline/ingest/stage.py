@@ -19,11 +19,12 @@ from pipeline.catalogue import (
     stated_path,
     write_catalogue,
 )
+from pipeline.files import hash_file
 from pipeline.logs.decode import Decoder, UndecodableChannel, UndecodableMessage, decoder_for
 from pipeline.logs.decode import field as field_of
 from pipeline.logs.parts import mission_name, recorded_parts
 from pipeline.logs.reader import Channel, MissionLog, open_log, open_parts
-from pipeline.manifest import StageResult, hash_file, read_manifest, run_stage
+from pipeline.manifest import StageResult, read_manifest, run_stage
 from pipeline.mapping.guess import suggest_mapping
 from pipeline.progress import Progress
 

@@ -4,11 +4,11 @@ Chunks, attachments and metadata of the source are not unpacked, let alone packe
 source in time; readers that follow the index, and ours, put the messages of both in order.
 """
 
-import os
 from pathlib import Path
 from typing import BinaryIO, Final
 
 from cadence.errors import InputError
+from pipeline.files import replacing
 from pipeline.logs.index import MAX_ID
 from pipeline.logs.reader import Channel, MissionLog, open_log
 from pipeline.logs.recorder import Packing, Recorder
@@ -30,18 +30,13 @@ def write_combined(source: Path, side: Path, target: Path, packing: Packing, pro
     added = open_log(side)
     if not added.health.is_complete:
         raise InputError(f"{side}: is damaged ({'; '.join(added.health.problems)}); export again")
-    draft = target.with_name(f".{target.name}.{os.getpid()}")
-    try:
-        with source.open("rb") as source_file, draft.open("wb") as target_file:
-            found = _read_index(source, source_file, added)
-            _copy(source, source_file, target_file, found.data_end, progress)
-            # Continued from what the source states, and not computed: where its bytes were changed, the sum stays wrong.
-            recorder = Recorder(target_file, packing, found.index, found.data_end, found.checksum or None)
-            _add(added, recorder, progress)
-            recorder.finish()
-        os.replace(draft, target)
-    finally:
-        draft.unlink(missing_ok=True)
+    with replacing(target) as draft, source.open("rb") as source_file, draft.open("wb") as target_file:
+        found = _read_index(source, source_file, added)
+        _copy(source, source_file, target_file, found.data_end, progress)
+        # Continued from what the source states, and not computed: where its bytes were changed, the sum stays wrong.
+        recorder = Recorder(target_file, packing, found.index, found.data_end, found.checksum or None)
+        _add(added, recorder, progress)
+        recorder.finish()
 
 
 def _read_index(source: Path, file: BinaryIO, added: MissionLog) -> SourceIndex:

@@ -16,7 +16,8 @@ import pyarrow as pa
 
 from cadence.errors import InputError
 from pipeline.arrays import Float32s, Float64s, Int64s
-from pipeline.manifest import hash_file, read_manifest
+from pipeline.files import hash_file
+from pipeline.manifest import read_manifest
 from pipeline.obstacle_file import OBSTACLES_NAME, read_obstacle_entries
 from pipeline.report.origins import Origins, origins_of, with_likeliest
 from pipeline.results import AgentHypotheses, MissionHypotheses, WindowHypotheses, read_hypothesis_tables

@@ -2,8 +2,6 @@
 
 import hashlib
 import json
-import os
-import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -20,8 +18,10 @@ from cadence.worlds.prison_map import CELL_M
 from cadence.worlds.rendezvous import RendezvousConfig, simulate_rendezvous
 from cadence.worlds.rendezvous_map import GOALS_M, SITES_M
 from pipeline.config import config_as_dict
+from pipeline.files import hash_file, replacing, write_atomic
+from pipeline.locks import clear_abandoned
 from pipeline.logs.reader import open_log
-from pipeline.manifest import StageResult, hash_file, manifest_path, write_atomic
+from pipeline.manifest import StageResult, manifest_path
 from pipeline.progress import Progress
 from pipeline.provenance import versions
 from pipeline.simulate.forms import Encoding
@@ -112,7 +112,7 @@ def simulate(out: Path, config: SimulateConfig, progress: Progress, force: bool 
     it, whatever its `num_episodes` and `first_index`: a call that was killed goes on where it was. The same settings give
     the same bytes. `StageResult.outputs` are the logs in order. Raises `DeviceError` where `out` cannot be written.
     """
-    _prepare(out)
+    _prepare(out, config.stem)
     indices = range(config.first_index, config.first_index + config.num_episodes)
     scores: list[_Score] = []
     num_written = 0
@@ -141,14 +141,13 @@ def simulate(out: Path, config: SimulateConfig, progress: Progress, force: bool 
     return StageResult(STAGE, "done" if num_written else "skipped", outputs, {**_summary(scores), "num_written": num_written})
 
 
-def _prepare(out: Path) -> None:
-    """Make the folder; parts that a killed call left behind go."""
+def _prepare(out: Path, stem: str) -> None:
+    """Make the folder; what a killed call left of these episodes goes."""
     try:
         out.mkdir(parents=True, exist_ok=True)
-        for part in out.glob(f".{STAGE}.*.part"):
-            part.unlink(missing_ok=True)
     except OSError as error:
         raise DeviceError(f"{out}: cannot write there ({error.strerror}); choose another --out") from error
+    clear_abandoned(out, f".{stem}-")
 
 
 def _key(config: SimulateConfig, index: int) -> str:
@@ -193,25 +192,15 @@ def _episodes(config: SimulateConfig, indices: Sequence[int]) -> Iterator[Episod
 
 
 def _write_episode(path: Path, episode: Episode, config: SimulateConfig, index: int) -> _Score:
-    """Write one episode's log under a temporary name, then rename it."""
+    """Write one episode's log, whole or not at all."""
     is_detected = episode.is_detected()
     gaps = tuple(float(gap) for agent in is_detected for gap in gaps_s(agent, _step_s(episode)))
     rate, count = round(float(is_detected.mean()), 6), len(episode.detections)
     mission = _mission_record(episode, config, index)
     mission |= {"measured_detection_rate": rate, "num_detections": count, "gaps_s": gaps, "key": _key(config, index)}
-    try:
-        handle, name = tempfile.mkstemp(prefix=f".{STAGE}.", suffix=".part", dir=path.parent)
-        os.close(handle)
-        part = Path(name)
-        try:
-            write_mission(part, episode, config.form(), mission)
-            digest = hash_file(part)
-            part.chmod(0o644)
-            os.replace(part, path)
-        finally:
-            part.unlink(missing_ok=True)
-    except OSError as error:
-        raise DeviceError(f"{path}: cannot write ({error.strerror}); check the folder and the free space") from error
+    with replacing(path) as draft:
+        write_mission(draft, episode, config.form(), mission)
+        digest = hash_file(draft)
     return _Score(path.name, digest, rate, count, gaps)
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from cadence.baselines.grammi import GrammiNetwork
@@ -19,10 +19,18 @@ from cadence.errors import ConfigError
 from cadence.recordings import Recordings, cut_windows
 from cadence.training.loop import Loss, Trainer
 from cadence.training.mixtures import MixtureWindows, grammi_loss, hidden_goals, mixture_windows, vrnn_loss
-from pipeline.checkpoints import CheckpointInfo, expect_preset, load_weights, read_info, save_checkpoint
+from pipeline.checkpoints import (
+    CheckpointInfo,
+    expect_preset,
+    load_weights,
+    read_info,
+    read_note,
+    save_checkpoint,
+    write_tensors,
+)
 from pipeline.episodes.recordings import RecordingsConfig, load_recordings
 from pipeline.estimators.mixtures import RIVALS, GrammiConfig, VrnnConfig, fresh_rival, rival_config
-from pipeline.manifest import StageResult, write_atomic
+from pipeline.manifest import StageResult
 from pipeline.progress import Progress
 from pipeline.train.config import RivalTraining, TrainConfig
 from pipeline.train.run import OUTPUTS, TrainingRun, run_training
@@ -203,20 +211,18 @@ class _Best:
     """The weights of least validation loss so far, kept beside the training's state."""
 
     def __init__(self, out: Path, key: str, force: bool) -> None:
-        self.weights, self.note = out / "best.safetensors", out / "best.json"
-        self.key = key
+        self.weights, self.key = out / "best.safetensors", key
         self.step, self.loss = -1, float("inf")
-        if not force and self.note.is_file():
-            found = json.loads(self.note.read_text(encoding="utf-8"))
-            if found["key"] == key:
-                self.step, self.loss = found["step"], found["loss"]
+        note = read_note(self.weights) if self.weights.is_file() and not force else None
+        found = json.loads(note) if note is not None else {}
+        if found.get("key") == key:
+            self.step, self.loss = found["step"], found["loss"]
 
     def offer(self, step: int, loss: float, network: nn.Module) -> None:
         """Keep the network if it is better than all before."""
         if loss < self.loss:
             self.step, self.loss = step, loss
-            save_file({name: value.contiguous() for name, value in network.state_dict().items()}, self.weights)
-            write_atomic(self.note, json.dumps({"key": self.key, "step": step, "loss": loss}) + "\n")
+            write_tensors(self.weights, network.state_dict(), json.dumps({"key": self.key, "step": step, "loss": loss}))
 
     def ship(self, result: StageResult, network: nn.Module) -> StageResult:
         """Put the best weights into the checkpoint, in place of the last ones."""

@@ -2,7 +2,6 @@
 
 import csv
 import io
-import os
 import sys
 import time
 from collections.abc import Callable
@@ -11,14 +10,23 @@ from pathlib import Path
 from typing import Any
 
 from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file
 from torch import nn
 
 from cadence.errors import InputError
 from cadence.training.loop import Loss, Trainer
-from pipeline.checkpoints import WEIGHTS_NAME, CheckpointInfo, read_info, save_checkpoint, windows_seen
+from pipeline.checkpoints import (
+    WEIGHTS_NAME,
+    CheckpointInfo,
+    read_info,
+    read_note,
+    save_checkpoint,
+    windows_seen,
+    write_tensors,
+)
 from pipeline.config import config_as_dict
-from pipeline.manifest import StageResult, write_atomic
+from pipeline.files import write_atomic
+from pipeline.manifest import StageResult
 from pipeline.progress import Progress
 from pipeline.train.config import TrainConfig
 
@@ -95,10 +103,12 @@ def run_training(
 
 
 def _resume(run: TrainingRun, trainer: Trainer) -> Curve:
-    path, key = run.out / "state.safetensors", run.out / "state.key"
-    if not path.is_file() or not key.is_file() or key.read_text(encoding="utf-8") != run.key:
+    path = run.out / "state.safetensors"
+    if not path.is_file():
         return []
     try:
+        if read_note(path) != run.key:
+            return []
         trainer.restore(load_file(path))
         with (run.out / "curve.csv").open(newline="", encoding="utf-8") as file:
             rows = list(csv.reader(file))[1:]
@@ -111,10 +121,7 @@ def _save(run: TrainingRun, trainer: Trainer, curve: Curve, cpu_seconds: float |
     table = io.StringIO()
     csv.writer(table).writerows([("step", "loss", "validation_loss"), *curve])
     write_atomic(run.out / "curve.csv", table.getvalue())
-    partial = run.out / f".state.{os.getpid()}.part"
-    save_file(trainer.state(), partial)
-    write_atomic(run.out / "state.key", run.key)
-    os.replace(partial, run.out / "state.safetensors")
+    write_tensors(run.out / "state.safetensors", trainer.state(), run.key)
     training = {
         "command": "cadence " + " ".join(sys.argv[1:]),
         "config": config_as_dict(run.config),

@@ -5,15 +5,15 @@ A killed training finds its shards again; a shard is written beside its name and
 
 import dataclasses
 import hashlib
-import os
 from pathlib import Path
 
 import torch
 from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file
 
 from cadence.diffusion.residual import ResidualContext
 from cadence.training.synthetic import ResidualWindows, SyntheticConfig, synthesise
+from pipeline.checkpoints import write_tensors
 
 SCENARIOS_PER_SHARD = 32
 
@@ -37,13 +37,9 @@ def synthetic_shard(folder: Path, config: SyntheticConfig, seed: int, index: int
 
 
 def write_windows(windows: ResidualWindows, path: Path) -> None:
-    """Write training windows; atomic."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    tensors = {f"context.{name}": getattr(windows.context, name).contiguous() for name in _CONTEXT_FIELDS}
-    tensors |= {"residual": windows.residual.contiguous(), "sample": windows.sample.to(torch.float16).contiguous()}
-    partial = path.with_suffix(f".{os.getpid()}.part")
-    save_file(tensors, partial)
-    os.replace(partial, path)
+    """Write training windows, whole or not at all."""
+    tensors = {f"context.{name}": getattr(windows.context, name) for name in _CONTEXT_FIELDS}
+    write_tensors(path, {**tensors, "residual": windows.residual, "sample": windows.sample.to(torch.float16)})
 
 
 def read_windows(path: Path) -> ResidualWindows | None:

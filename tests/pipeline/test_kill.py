@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 from fixtures.batch import hidden_in, processes_of, results_of, start, start_command, write_tiny_logs
 
+from pipeline.files import hash_file
 from pipeline.locks import locked
-from pipeline.manifest import hash_file
 
 pytestmark = pytest.mark.timeout(300)  # on a busy machine the first process takes long to import everything
 NUM_KILLS = int(os.environ.get("CADENCE_KILLS", "6"))

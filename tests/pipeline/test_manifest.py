@@ -1,15 +1,14 @@
 """Stages are atomic, skipped only when nothing changed, and never leave a mixture."""
 
 import json
-import os
-import stat
 from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 
 from cadence.errors import DeviceError, InputError
-from pipeline.manifest import hash_file, manifest_path, read_manifest, run_stage, write_atomic
+from pipeline.files import hash_file
+from pipeline.manifest import manifest_path, read_manifest, run_stage
 
 
 @dataclass(frozen=True)
@@ -125,25 +124,6 @@ def test_unwritable_folder_is_one_line(tmp_path, source):
 def test_full_disk_is_a_device_error(tmp_path, source):
     with pytest.raises(DeviceError, match="could not write its output"):
         run(tmp_path, source, Body(error=OSError(28, "No space left on device")))
-
-
-def test_write_atomic_replaces_and_honours_the_umask(tmp_path):
-    path = tmp_path / "deep" / "x.json"
-    before = os.umask(0o022)
-    try:
-        write_atomic(path, "old")
-        write_atomic(path, "new")
-    finally:
-        os.umask(before)
-    assert path.read_text() == "new" and files_of(path.parent) == ["x.json"]
-    assert stat.S_IMODE(path.stat().st_mode) == 0o644
-
-
-def test_write_atomic_that_fails_leaves_no_draft(tmp_path):
-    (tmp_path / "x.json").mkdir()
-    with pytest.raises(DeviceError, match="cannot write"):
-        write_atomic(tmp_path / "x.json", "text")
-    assert files_of(tmp_path) == ["x.json"]
 
 
 def test_manifest_is_the_same_bytes_each_time(tmp_path, source):

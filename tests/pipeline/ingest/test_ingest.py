@@ -9,9 +9,9 @@ from mcap.writer import Writer
 from cadence.errors import InputError
 from pipeline.catalogue import open_catalogued_log, read_catalogue
 from pipeline.extract.stage import ExtractConfig, extract
+from pipeline.files import hash_file
 from pipeline.ingest.stage import IngestConfig, ingest
 from pipeline.logs.reader import open_log
-from pipeline.manifest import hash_file
 from pipeline.missions import CATALOGUE_NAME
 from pipeline.progress import Progress
 

@@ -12,7 +12,7 @@ from mcap.opcode import Opcode
 from mcap.reader import NonSeekingReader, make_reader
 from mcap.writer import CompressionType, IndexType, Writer
 
-from cadence.errors import InputError
+from cadence.errors import DeviceError, InputError
 from pipeline.logs import append
 from pipeline.logs.append import write_combined
 from pipeline.logs.index import FOOTER_BYTES
@@ -328,7 +328,7 @@ def test_failure_in_the_middle_leaves_nothing(tmp_path, monkeypatch):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(append.Recorder, "finish", full)
-    with pytest.raises(OSError, match="No space"):
+    with pytest.raises(DeviceError, match="No space"):
         combine(tmp_path, source, side)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["side.mcap", "source.mcap"]
 
@@ -346,8 +346,8 @@ def test_killed_process_leaves_no_file_that_looks_finished(tmp_path):
     with subprocess.Popen(command, stdout=subprocess.PIPE) as child:
         assert child.stdout.readline() == b"now\n"
         os.kill(child.pid, signal.SIGKILL)
-    left = sorted(path.name for path in tmp_path.iterdir())
-    assert left == [f".target.mcap.{child.pid}", "side.mcap", "source.mcap"], "a hidden draft at most"
+    left = [path.name for path in tmp_path.iterdir() if not path.name.startswith(".target.mcap.")]
+    assert sorted(left) == ["side.mcap", "source.mcap"], "a hidden draft at most"
 
 
 def test_target_of_an_earlier_run_stays_until_the_new_one_is_complete(tmp_path):

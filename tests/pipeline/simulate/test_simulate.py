@@ -195,7 +195,9 @@ def test_a_killed_call_goes_on_where_it_was(tmp_path: Path, monkeypatch: pytest.
     with pytest.raises(KeyboardInterrupt):
         simulate(out, config, QUIET)
     assert [path.name for path in out.iterdir()] == ["patrol-6-0000.mcap"]
-    (out / ".simulate.left.part").write_bytes(b"from a call that had no time to clean up")
+    left = out / ".patrol-6-0001.mcap.0123abcd"
+    left.mkdir()
+    (left / "patrol-6-0001.mcap").write_bytes(b"from a call that had no time to clean up")
     monkeypatch.undo()
     result = simulate(out, config, QUIET)
     assert result.summary["num_written"] == 2

@@ -14,7 +14,7 @@ from cadence.baselines.vrnn import VrnnNetworkConfig
 from cadence.errors import ConfigError
 from cadence.recordings import Recordings, choose_windows, cut_windows
 from cadence.training.loop import OptimiserConfig
-from pipeline.checkpoints import read_info
+from pipeline.checkpoints import read_info, read_note
 from pipeline.config import read_config
 from pipeline.episodes.recordings import RecordingsConfig, save_recordings
 from pipeline.estimators.mixtures import load_rival
@@ -61,7 +61,7 @@ def test_a_killed_training_goes_on_and_ends_as_an_unbroken_one(preset, tmp_path)
         train_rival(tmp_path / "broken", rounded, *parts, Killer(5))
     again = train_rival(tmp_path / "broken", rounded, *parts, QUIET)
     assert again.summary["steps"] == 6
-    for name in ("checkpoint.safetensors", "curve.csv", "best.json"):
+    for name in ("checkpoint.safetensors", "curve.csv", "best.safetensors"):
         assert (tmp_path / "broken" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes(), name
     found = [json.loads((tmp_path / folder / "checkpoint.json").read_text()) for folder in ("broken", "whole")]
     assert all(item["training"].pop("cpu_seconds") > 0 for item in found) and found[0] == found[1]
@@ -86,7 +86,7 @@ def test_the_checkpoint_is_the_best_one_and_not_the_last(tmp_path):
     assert info.scores == {"validation_loss": losses[best]}
     shorter = dataclasses.replace(spoiling, optimiser=dataclasses.replace(spoiling.optimiser, num_steps=2))
     train_rival(tmp_path, shorter, recordings(), recordings(1), QUIET)
-    assert json.loads((tmp_path / "best.json").read_text())["step"] == 2  # another configuration forgets the old best
+    assert json.loads(read_note(tmp_path / "best.safetensors"))["step"] == 2  # another configuration forgets the old best
 
 
 def test_grammi_goes_on_from_the_model_without_mutual_information(tmp_path):

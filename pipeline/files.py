@@ -1,0 +1,74 @@
+"""Files that are whole or not there, and their hashes."""
+
+import contextlib
+import hashlib
+import os
+import secrets
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+from cadence.errors import DeviceError, InputError
+from pipeline.locks import clear_abandoned, locked
+
+
+def hash_file(path: Path) -> str:
+    """SHA-256 of the content, read in blocks; `InputError` where the file is absent or cannot be read."""
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: not found; check the path, or run the stage that writes it first") from error
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); check that it is a file and its permissions") from error
+
+
+def write_atomic(path: Path, text: str) -> None:
+    """Write a small text file so that readers see the old or the new content, never a part."""
+    with replacing(path) as draft:
+        draft.write_text(text, encoding="utf-8")
+
+
+@contextlib.contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """A draft to write to, which takes the place of `path` where the block ends without an exception.
+
+    Readers see the old or the new content, never a part. What a killed process left is removed by the next one.
+    Raises `DeviceError` where the folder or the disk does not take it.
+    """
+    clear_abandoned(path.parent, f".{path.name}.")
+    with working_folder(path.parent, path.name) as work:
+        draft = work / path.name
+        try:
+            yield draft
+            os.replace(draft, path)
+        except OSError as error:
+            raise DeviceError(f"{path}: cannot write ({error.strerror}); check the folder and the free space") from error
+
+
+@contextlib.contextmanager
+def working_folder(directory: Path, name: str) -> Iterator[Path]:
+    """A hidden folder of this process alone inside `directory`, which is made where it is absent; removed with all it holds.
+
+    `clear_abandoned` knows it by `.NAME.` where a killed process left it. Raises `DeviceError` where it cannot be written to.
+    """
+    is_new = not directory.exists()
+    work = directory / f".{name}.{secrets.token_hex(4)}"
+    try:  # begins before the folder is there, as a signal may end it at any moment
+        try:
+            directory.mkdir(parents=True, exist_ok=True)
+            work.mkdir(mode=0o700)
+        except OSError as error:
+            raise DeviceError(
+                f"{directory}: cannot write there ({error.strerror}); choose another folder with --out"
+            ) from error
+        try:
+            with locked(work):  # so that others know it from what a killed process left
+                yield work
+        except OSError as error:
+            raise DeviceError(f"{directory}: {name} could not write its output ({error}); check the free space") from error
+    finally:
+        shutil.rmtree(work, ignore_errors=True)
+        if is_new:
+            with contextlib.suppress(OSError):  # the folder stays where it holds something
+                directory.rmdir()
