@@ -8,7 +8,7 @@ from typing import Any, get_args
 
 from cadence.errors import ImplausibleInputError, PartialInputError
 from pipeline.batch.outcome import LogOutcome, Status
-from pipeline.extract.plausibility import suspicions_in
+from pipeline.extract.plausibility import few, suspicions_in
 from pipeline.manifest import StageResult
 from pipeline.stores.urls import shown
 
@@ -32,7 +32,7 @@ def stage_summary(result: StageResult) -> str:
     numbers = [_named(name, value) for name, value in result.summary.items() if type(value) in (int, float) and value]
     lines = [f"{result.stage}: {result.status}", *([f"  {', '.join(numbers)}"] if numbers else [])]
     lines += score_lines(result.summary.get("scores", ()))
-    lines += [f"  suspected {line}" for line in suspicions_in(result.summary)]
+    lines += [f"  suspected {line}" for line in few(suspicions_in(result.summary))]
     return "\n".join(lines + [f"  {path}" for path in result.outputs])
 
 
@@ -93,7 +93,7 @@ def batch_summary(outcomes: Sequence[LogOutcome]) -> str:
         rows.append((outcome.task.name, outcome.status, windows, agents, detections, elapsed, outcome.message))
         for stage in outcome.stages:
             lines += [f"{outcome.task.name}: damaged: {problem}" for problem in stage.summary.get("problems", ())]
-            lines += [f"{outcome.task.name}: suspected {line}" for line in suspicions_in(stage.summary)]
+            lines += [f"{outcome.task.name}: suspected {line}" for line in few(suspicions_in(stage.summary))]
             if stage.stage in SHOWN_STAGES and len(outcomes) <= MAX_LOGS_WITH_FILES:
                 lines += [f"  {path}" for path in stage.outputs]
     return "\n".join([*_table(rows), *lines])

@@ -12,7 +12,7 @@ import numpy as np
 from pipeline.arrays import Bools
 from pipeline.extract.covariances import are_apart
 from pipeline.extract.plausibility import Suspicions
-from pipeline.extract.positions import Positions
+from pipeline.extract.positions import Positions, numbered
 
 _MAX_SHARED: Final = 0.05
 """Of the messages that hold a name: with more in which it stands at several places it is no name at all; with fewer the odd
@@ -59,8 +59,9 @@ def _without_shared(rows: Positions, is_judged: Bools, tolerance_ns: int, suspic
 def _is_shared(rows: Positions, tolerance_ns: int) -> Bools:
     """Which rows [N] bear a name that another row of the same message and moment bears at a place that does not agree."""
     found = np.zeros(len(rows), np.bool_)
-    named = np.flatnonzero(rows.agent != None)  # noqa: E711 (elementwise)
-    _, name = np.unique(rows.agent[named].astype(np.str_), return_inverse=True)
+    name = numbered(rows.agent)
+    named = np.flatnonzero(name >= 0)
+    name = name[named]
     order = np.lexsort((rows.time_ns[named], name, rows.message[named]))
     name, ordered = name[order], named[order]
     before, after = ordered[:-1], ordered[1:]

@@ -5,13 +5,15 @@ they do not fit says what was seen, what was done instead, and by which setting 
 given, silences the suspicion.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 Kind = Literal["identity", "time", "place", "covariance", "duplication", "stage"]
 """identity: who was seen; time: when; place: where, in which frame and unit; covariance: how accurately; duplication: the same
 thing counted twice; stage: what a channel holds (detections, or a step of work on them)."""
+
+_MAX_SHOWN: Final = 10
 
 
 @dataclass(frozen=True)
@@ -59,6 +61,12 @@ class Suspicions:
     def records(self) -> list[dict[str, str]]:
         """The suspicions for a stage's summary (`suspicions`)."""
         return [asdict(suspicion) for suspicion in self._found]
+
+
+def few(sentences: Sequence[str]) -> list[str]:
+    """The sentences for people: where a fault is in each of many channels, the first ones and how many more there are."""
+    rest = [f"{len(sentences) - _MAX_SHOWN} more are in extract.manifest.json"] if len(sentences) > _MAX_SHOWN else []
+    return [*sentences[:_MAX_SHOWN], *rest]
 
 
 def suspicions_in(summary: Mapping[str, Any]) -> list[str]:

@@ -12,6 +12,7 @@ from functools import partial
 from typing import Any, Self
 
 import numpy as np
+import pyarrow as pa
 
 from cadence.errors import ConfigError
 from pipeline.arrays import Bools, Column, Float32s, Float64s, Int64s, Objects
@@ -69,6 +70,12 @@ class Positions:
     def concatenate(cls, parts: Sequence["Positions"]) -> "Positions":
         """All rows of `parts`, in order."""
         return cls(*(np.concatenate([getattr(part, item.name) for part in parts]) for item in fields(cls)))
+
+
+def numbered(names: Objects) -> Int64s:
+    """Numbers [N] of names, equal where they are; -1 for None."""
+    found = pa.array(names, type=pa.string()).dictionary_encode().indices
+    return np.asarray(found.fill_null(-1).to_numpy(zero_copy_only=False), dtype=np.int64)
 
 
 class Rows:

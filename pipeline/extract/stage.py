@@ -8,6 +8,7 @@ import itertools
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,14 +20,16 @@ from pipeline.arrays import Objects
 from pipeline.catalogue import open_catalogued_log, read_catalogue
 from pipeline.extract.collapse import Collapsed, collapse
 from pipeline.extract.identity import without_false_names
+from pipeline.extract.mission_clock import on_one_clock
 from pipeline.extract.obstacle_sources import ObstacleSources, collect_obstacles
 from pipeline.extract.placement import Placing, bring_together, in_enu, mission_frame, place
-from pipeline.extract.plausibility import Kind, Suspicions
+from pipeline.extract.plausibility import Kind, Suspicions, few
 from pipeline.extract.positions import ChannelReader, Positions, Rows
 from pipeline.extract.reading import read_positions
 from pipeline.extract.selection import ROLES, select_readers, selected_channels
 from pipeline.extract.spikes import is_spike
 from pipeline.extract.stamps import moment_ns
+from pipeline.extract.stretches import without_set_back, without_unjoined
 from pipeline.extract.summary import summarise, tell
 from pipeline.extract.thinning import ThinningConfig, is_seen, noise
 from pipeline.extract.transform_messages import LogTransforms
@@ -148,7 +151,7 @@ def write_tables(log: MissionLog, folder: Path, config: ExtractConfig, progress:
             f'extract: frame {frame.frame_id} may be north-east-down; if so give its sources frame_convention = "ned"'
         )
     if config.is_strict and suspicions:
-        refused = "; ".join(suspicions.lines())
+        refused = "; ".join(few(suspicions.lines()))
         raise ImplausibleInputError(f"{log.path}: refused by --strict, as something in it is suspected: {refused}")
     summary = summarise(log, readers, detections.positions, truth, poses, frame, counts, suspicions, len(obstacles))
     return summary | {"transforms": transforms.summary(counts)}
@@ -177,11 +180,14 @@ def _rows_in_frame(
     transforms: LogTransforms,
 ) -> tuple[dict[str, Positions], Frame]:  # fmt: skip
     """The rows of every role, placed in the mission frame and thinned, and that frame."""
-    rows = {role: _columns(role, readers, counts) for role in ROLES}
+    parts = {role: _numbered([(reader, reader.finish()) for reader in readers if reader.role == role]) for role in ROLES}
+    timed, clock = on_one_clock(without_set_back(parts, suspicions), suspicions)
+    rows = {role: _columns(timed[role], counts) for role in ROLES}
     primary = "truth" if config.thinning.enabled and config.thinning.thin_from == "truth" else "detections"
     _check_any(primary, rows[primary], counts)
+    rows = without_unjoined(rows, primary, suspicions)
     placing = Placing(config.frame, Limits(config.max_extrapolation_s, config.max_transform_gap_s))
-    rows = bring_together(rows, primary, placing, transforms.read, counts)
+    rows = bring_together(rows, primary, placing, partial(transforms.read, clock), counts)
     _check_any(primary, rows[primary], counts)
     rows = {role: in_enu(positions) for role, positions in rows.items()}
     frame = mission_frame(rows[primary], [rows[role] for role in ROLES if role != primary], config.datum)
@@ -196,11 +202,10 @@ def _rows_in_frame(
     return rows, frame
 
 
-def _columns(role: str, readers: Sequence[ChannelReader], counts: Counter[str]) -> Positions:
+def _columns(parts: Sequence[Positions], counts: Counter[str]) -> Positions:
     """All finite rows of a role, sorted by time."""
-    parts = _numbered([reader.finish() for reader in readers if reader.role == role])
     counts["out_of_order"] += sum(int((part.time_ns < np.maximum.accumulate(part.time_ns)).sum()) for part in parts)
-    rows = Positions.concatenate(parts or [Rows().finish()])
+    rows = Positions.concatenate(list(parts) or [Rows().finish()])
     is_finite = np.isfinite(rows.first) & np.isfinite(rows.second)
     # A latitude off the earth is as little a position as NaN.
     is_finite &= ~rows.is_geodetic | ((np.abs(rows.first) <= 90) & (np.abs(rows.second) <= 360))
@@ -209,12 +214,12 @@ def _columns(role: str, readers: Sequence[ChannelReader], counts: Counter[str]) 
     return rows[np.argsort(rows.time_ns, kind="stable")]
 
 
-def _numbered(parts: Sequence[Positions]) -> list[Positions]:
+def _numbered(parts: Sequence[tuple[ChannelReader, Positions]]) -> list[tuple[ChannelReader, Positions]]:
     """The rows of each reader, with numbers of messages that no other reader has."""
-    sizes = [int(part.message.max(initial=0)) for part in parts]
+    sizes = [int(part.message.max(initial=0)) for _, part in parts]
     return [
-        replace(part, message=part.message + before)
-        for part, before in zip(parts, itertools.accumulate(sizes, initial=0), strict=False)
+        (reader, replace(part, message=part.message + before))
+        for (reader, part), before in zip(parts, itertools.accumulate(sizes, initial=0), strict=False)
     ]
 
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.extract.plausibility import Suspicions
+from pipeline.extract.plausibility import Suspicions, few
 from pipeline.extract.positions import ChannelReader, Positions
 from pipeline.extract.selection import ROLES
 from pipeline.logs.reader import MissionLog
@@ -38,7 +38,7 @@ def tell(counts: Counter[str], suspicions: Suspicions, detections: Positions, lo
     if apart_s > _STAMPS_APART_S:
         advice = 'to use the log times give the source time = "log_time"'
         progress.note(f"extract: stamps and log times are {apart_s:.0f} s apart; the stamps are used; {advice}")
-    for line in suspicions.lines():
+    for line in few(suspicions.lines()):
         progress.note(f"extract: suspected {line}")
     for problem in log.health.problems:
         progress.note(f"extract: {problem}")

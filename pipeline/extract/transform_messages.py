@@ -12,6 +12,8 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
+from pipeline.extract.clocks import Stamps
+from pipeline.extract.mission_clock import MissionClock
 from pipeline.extract.stamps import stamp_ns
 from pipeline.extract.transforms import Link, TransformTree, tree_of
 from pipeline.logs.decode import UndecodableChannel, UndecodableMessage, decoder_for
@@ -47,15 +49,18 @@ class _Samples:
     """Growing samples of one link."""
 
     def __init__(self) -> None:
-        self.times = array("q")
+        self.times, self.log_times = array("q"), array("q")
         self.poses = array("d")
 
-    def link(self, parent: str, child: str, kind: Kind) -> Link:
+    def link(self, parent: str, child: str, kind: Kind, clock: MissionClock) -> Link:
         """The samples by time; of several at one time the last counts, of static ones the last in the log."""
         times = np.array(self.times, dtype=np.int64)
         poses = np.array(self.poses, dtype=np.float64).reshape(-1, 7)
         if kind == "static" or (kind == "unmarked" and (poses == poses[0]).all()):
             return Link(parent, child, times[-1:], poses[-1:, :3], poses[-1:, 3:], is_static=True)
+        stamps = Stamps(times, np.array(self.log_times, dtype=np.int64), poses)
+        times, is_kept = clock.mended(f"the transform {parent} → {child}", stamps)
+        times, poses = times[is_kept], poses[is_kept]
         order = np.argsort(times, kind="stable")
         times, poses = times[order], poses[order]
         is_last = np.append(times[1:] != times[:-1], True)
@@ -103,6 +108,7 @@ class _Reader:
             raise ValueError("no transform")
         samples = self.samples.setdefault((parent, child), _Samples())
         samples.times.append(stamp_ns(stamp) or log_time_ns)
+        samples.log_times.append(log_time_ns)
         samples.poses.extend((x, y, z, *(part / norm for part in turn)))
 
 
@@ -124,10 +130,10 @@ class LogTransforms:
         self.counts: Counter[str] = Counter()
         self.apart: set[str] = set()
 
-    def read(self) -> TransformTree:
-        """The trees; empty ones for a log without transforms."""
+    def read(self, clock: MissionClock) -> TransformTree:
+        """The trees, their times on the mission's clock; empty ones for a log without transforms."""
         if self._tree is None:
-            self._tree = read_transforms(self._log, self.counts, self._progress)
+            self._tree = read_transforms(self._log, clock, self.counts, self._progress)
         return self._tree
 
     def summary(self, counts: Counter[str]) -> dict[str, Any]:
@@ -151,8 +157,8 @@ class LogTransforms:
                 self._progress.note(f"extract: {self.counts[name]} {meaning}")
 
 
-def read_transforms(log: MissionLog, counts: Counter[str], progress: Progress) -> TransformTree:
-    """The trees of all transforms of the log; what cannot be used is added to `counts`.
+def read_transforms(log: MissionLog, clock: MissionClock, counts: Counter[str], progress: Progress) -> TransformTree:
+    """The trees of all transforms of the log, on the mission's clock; what cannot be used is added to `counts`.
 
     Odometry counts only for frames of which no transform tells.
     """
@@ -175,7 +181,7 @@ def read_transforms(log: MissionLog, counts: Counter[str], progress: Progress) -
     links: list[Link] = []
     for kind, found in samples.items():
         known = {link.child for link in links} if kind == "vehicle" else set()
-        links += [each.link(parent, child, kind) for (parent, child), each in found.items() if child not in known]
+        links += [each.link(parent, child, kind, clock) for (parent, child), each in found.items() if child not in known]
     return tree_of(links)
 
 

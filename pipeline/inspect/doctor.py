@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from cadence.errors import CadenceError, ImplausibleInputError, InputError, PartialInputError, UsageError
-from pipeline.extract.plausibility import suspicions_in
+from pipeline.extract.plausibility import few, suspicions_in
 from pipeline.extract.stage import ExtractConfig, write_tables
 from pipeline.ingest.stage import survey_channels
 from pipeline.inspect.log_times import time_remarks
@@ -128,7 +128,7 @@ def render(diagnosis: Diagnosis) -> str:
     }  # fmt: skip
     for name, title in titles.items():
         if getattr(diagnosis, name):
-            lines += [f"{title}:", *(f"  {sentence}" for sentence in getattr(diagnosis, name))]
+            lines += [f"{title}:", *(f"  {sentence}" for sentence in few(getattr(diagnosis, name)))]
     if diagnosis.use or diagnosis.no_use:
         lines += ["What `cadence run` would use:", *(f"  {line}" for line in _use_lines(diagnosis))]
     if diagnosis.advice:

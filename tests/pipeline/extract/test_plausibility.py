@@ -8,7 +8,7 @@ from fixtures.small_logs import Row, stamp, write_log
 
 from cadence.errors import ImplausibleInputError
 from cli import main
-from pipeline.extract.plausibility import Suspicion, Suspicions, suspicions_in
+from pipeline.extract.plausibility import Suspicion, Suspicions, few, suspicions_in
 from pipeline.extract.stage import ExtractConfig, extract
 from pipeline.ingest.stage import IngestConfig, ingest
 from pipeline.inspect.doctor import diagnose, exit_code, render
@@ -46,6 +46,8 @@ def test_a_suspicion_is_one_sentence_and_survives_a_manifest() -> None:
     assert found.lines() == [sentence] and len(found) == 1
     assert suspicions_in(json.loads(json.dumps({"suspicions": found.records()}))) == [sentence] and suspicions_in({}) == []
     assert not Suspicions(["time"]).looks_for("time") and Suspicions(["time"]).looks_for("place")
+    assert few([sentence] * 10) == [sentence] * 10
+    assert few([sentence] * 15) == [*[sentence] * 10, "5 more are in extract.manifest.json"]
     assert Suspicion(**found.records()[0]).kind == "time"
 
 
