@@ -23,13 +23,14 @@ _Entry = tuple[Any, Any]
 _INTEGERS: Final = frozenset(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64))
 _FLOATS: Final = frozenset({"float32", "float64"})
 _MATRIX_SIZES: Final = (4, 6, 9, 36)
+CONDITION: Final = "where"
+"""Names of fields that conditions look at begin with this."""
 _BASES: Final[Mapping[str, frozenset[str]]] = {
-    "flags": _INTEGERS,
     "frame_id": frozenset({"string"}),
     "agent": _INTEGERS | {"string"},
     "sensor": _INTEGERS | {"string"},
 }
-"""What a field may be; all others are numbers."""
+"""What a field may be; those of conditions anything plain, all others are numbers."""
 
 
 class FieldColumns:
@@ -92,6 +93,8 @@ class FieldColumns:
         elif kind == Nodetype.ARRAY and name == "covariance":
             if detail[0][0] == Nodetype.BASE and detail[0][1][0] in _FLOATS and detail[1] in _MATRIX_SIZES:
                 return (text,), _numbers
+        elif kind == Nodetype.BASE and name.startswith(CONDITION):
+            return (text,), np.asarray
         elif kind == Nodetype.BASE and name != "covariance" and detail[0] in _BASES.get(name, _INTEGERS | _FLOATS):
             return (text,), _times if name == "time" else np.asarray if name in _BASES else _numbers
         raise UndecodableChannel(f"path {path.text!r} leads to no plain {name}")

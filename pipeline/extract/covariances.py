@@ -13,14 +13,15 @@ from pipeline.arrays import Bools, Float64s
 Covariance = tuple[float, float, float, float, float, float]
 
 NONE_COVARIANCE: Final[Covariance] = (math.nan,) * 6
-MAX_SIGMA_M: Final = 1e5
-"""A position that may be this far off says nothing about a mission; drivers write 1e308 and its like for "unknown"."""
+MAX_SIGMA_M: Final = 1e4
+"""A position that may be this far off says nothing about a mission; drivers write 1e8 m² or 1e308 for "unknown"."""
 
 _MAX_SIGMAS: Final = 4.0
 _PLACES: Final = {  # xx, xy, yy and xz, yz, zz among as many numbers; without heights: only the first three
     4: (0, 1, 3),
     6: (0, 1, 3, 2, 4, 5),
     9: (0, 1, 4, 2, 5, 8),
+    21: (0, 1, 6, 2, 7, 11),
     36: (0, 1, 7, 2, 8, 14),
 }
 
@@ -30,18 +31,26 @@ def isotropic(variance_m2: float) -> Covariance:
     return (variance_m2, 0.0, variance_m2, 0.0, 0.0, variance_m2)
 
 
-def stated_covariance(matrix: Any) -> Covariance | None:
-    """The covariance that a message states; None where it says "unknown": another number of them, all zero, negative, or huge.
+def stated_sigma(sigma_m: float) -> Covariance | None:
+    """The covariance of a stated standard deviation; None where that says "unknown" (zero, negative, NaN, or huge)."""
+    return isotropic(sigma_m**2) if 0 < sigma_m < MAX_SIGMA_M else None
 
-    1 (a variance), 4, 9 or 36 numbers are rows of a matrix, 6 its upper triangle. `ValueError` where it is none.
+
+def stated_covariance(matrix: Any) -> Covariance | None:
+    """The covariance that a message states; None where it says "unknown": NaN, another number of them, zero, negative, or huge.
+
+    1 (a variance), 4, 9 or 36 numbers are rows of a matrix, 6 or 21 its upper triangle, 3 its diagonal. `ValueError` where it
+    is none.
     """
     if isinstance(matrix, int | float):
         matrix = (matrix, 0.0, 0.0, matrix)
+    elif len(matrix) == 3:
+        matrix = (matrix[0], 0.0, 0.0, matrix[1], 0.0, matrix[2])
     places = _PLACES.get(len(matrix))
     if places is None:
         return None
     xx, xy, yy, *rest = (float(matrix[place]) for place in places)
-    if xx == yy == 0 or xx < 0 or yy < 0 or xx > MAX_SIGMA_M**2 or yy > MAX_SIGMA_M**2:
+    if xx == yy == 0 or xx < 0 or yy < 0 or xx >= MAX_SIGMA_M**2 or yy >= MAX_SIGMA_M**2 or (xx != xx and yy != yy):
         return None
     if not (math.isfinite(xx) and math.isfinite(xy) and math.isfinite(yy) and xx * yy > xy * xy):
         raise ValueError("not positive definite")
@@ -68,7 +77,8 @@ def stated_covariances(matrices: Float64s) -> tuple[Float64s, Bools, Bools]:
     places = _PLACES[matrices.shape[1]]
     with np.errstate(all="ignore"):
         xx, xy, yy, *rest = (matrices[:, place] for place in places)
-        is_unknown = ((xx == 0) & (yy == 0)) | (xx < 0) | (yy < 0) | (xx > MAX_SIGMA_M**2) | (yy > MAX_SIGMA_M**2)
+        is_unknown = ((xx == 0) & (yy == 0)) | (xx < 0) | (yy < 0) | (xx >= MAX_SIGMA_M**2) | (yy >= MAX_SIGMA_M**2)
+        is_unknown |= np.isnan(xx) & np.isnan(yy)
         is_definite = np.isfinite(xx) & np.isfinite(xy) & np.isfinite(yy) & (xx * yy > xy * xy)
         xz, yz, zz = rest or [np.zeros_like(xx)] * 3
         has_height = np.isfinite(xz) & np.isfinite(yz) & np.isfinite(zz) & (zz > 0)

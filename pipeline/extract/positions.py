@@ -3,11 +3,12 @@
 What cannot be used is counted, never passed on in silence.
 """
 
+import json
 import math
 from array import array
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from typing import Any, Self
 
@@ -17,12 +18,21 @@ import pyarrow as pa
 from cadence.errors import ConfigError
 from pipeline.arrays import Bools, Column, Float32s, Float64s, Int64s, Objects
 from pipeline.extract.columns import FieldColumns, mapped
-from pipeline.extract.covariances import NONE_COVARIANCE, Covariance, isotropic, stated_covariance, stated_covariances
+from pipeline.extract.covariances import (
+    NONE_COVARIANCE,
+    Covariance,
+    isotropic,
+    stated_covariance,
+    stated_covariances,
+    stated_sigma,
+)
+from pipeline.extract.field_reader import FieldReader
 from pipeline.extract.stamps import stamp_ns
+from pipeline.extract.validity import Conditions
 from pipeline.logs.channels import Batch
 from pipeline.logs.decode import UndecodableChannel
 from pipeline.logs.reader import Channel, RawMessage
-from pipeline.mapping.message_path import MissingFieldError, Place, at_place, parse_path
+from pipeline.mapping.message_path import Place, at_place
 from pipeline.mapping.sources import LOG_TIME, PATH_KEYS, PUBLISH_TIME, SourceConfig, resolve_paths
 
 Point = tuple[Place, Any, Any, Any]
@@ -102,46 +112,6 @@ class Rows:
         )  # fmt: skip
 
 
-class FieldReader:
-    """Alternative message paths of one field; tries first the one that served the last message.
-
-    `convert` turns a value into what is kept, None where it is not filled in; then the next alternative is tried.
-    """
-
-    def __init__(self, texts: Iterable[str], is_needed: bool = False, convert: Callable[[Any], Any] | None = None) -> None:
-        self.paths = [parse_path(text) for text in texts]
-        self.is_needed = is_needed
-        self.is_found = False
-        self._problem: tuple[str, MissingFieldError] | None = None
-        self._convert = convert
-        self._order = list(range(len(self.paths)))
-
-    @property
-    def problem(self) -> str:
-        """What the last path that led nowhere was lacking."""
-        return "path {!r}: {}".format(*self._problem) if self._problem is not None else "it"
-
-    def located(self, message: Any) -> Mapping[Place, Any] | None:
-        """The values by place; None where no alternative leads anywhere."""
-        unfilled: Mapping[Place, Any] | None = None
-        for rank, number in enumerate(self._order):
-            try:
-                values = self.paths[number].located(message)
-            except MissingFieldError as error:
-                self._problem = self.paths[number].text, error
-                continue
-            self.is_found = True
-            if self._convert is not None:
-                values = {place: self._convert(value) for place, value in values.items()}
-                if values and all(value is None for value in values.values()):
-                    unfilled = unfilled or values
-                    continue
-            if rank:
-                self._order.insert(0, self._order.pop(rank))
-            return values
-        return unfilled
-
-
 class ChannelReader:
     """Reads one channel for one source. `named` holds what the topic says: agent, sensor."""
 
@@ -152,7 +122,7 @@ class ChannelReader:
         self.names = {"agent": named.get("agent", source.agent), "sensor": named.get("sensor", source.sensor)}
         names = _GEODETIC if self.is_geodetic else _METRIC
         alternatives = [getattr(paths, name) for name in names]
-        self.alternatives = paths.alternatives
+        self.alternatives, self.json_text = paths.alternatives, paths.json_text
         if self.alternatives == "first":
             self.positions = [tuple(self._field(name, texts) for name, texts in zip(names, alternatives, strict=True))]
         else:
@@ -162,6 +132,8 @@ class ChannelReader:
             ]
         fields = {name: self._field(name, getattr(paths, name)) for name in _OTHERS}
         self.fields = {name: reader for name, reader in fields.items() if reader.paths}
+        self.conditions = Conditions(paths.where, source.where is not None)
+        self.is_ned, self.is_north_first = paths.frame_convention == "ned", paths.is_north_first
         self.unknown = NONE_COVARIANCE if source.sigma_m is None else isotropic(source.sigma_m**2)
         self.rows = Rows()
         self.counts: Counter[str] = Counter()
@@ -179,20 +151,23 @@ class ChannelReader:
     def read(self, message: Any, raw: RawMessage) -> None:
         """Append the positions of one decoded message, or count why there are none."""
         self.counts["messages"] += 1
+        if self.json_text:
+            message = _opened(message, self.json_text)
         points = self._points(message)
         if points is None:
             self.counts["incomplete"] += 1
             return
         found = [(name, located) for name, reader in self.fields.items() if (located := reader.located(message))]
+        conditions = self.conditions.located(message)
         default_ns = raw.publish_time_ns if self.source.time == PUBLISH_TIME else raw.log_time_ns
         for place, first, second, z in points:
+            if not self.conditions.hold_at(conditions, place):
+                self.counts[self._unmet] += 1
+                continue
             values: dict[str, Any] = dict.fromkeys(_OTHERS)
             for name, located in found:
                 values[name] = located[place] if place in located else at_place(located, place)
-            if self._has_no_fix(values):
-                self.counts["no_fix"] += 1
-                continue
-            covariance = self._covariance(values["covariance"], values["covariance_type"])
+            covariance = self._covariance(values["covariance"], values["covariance_type"], values["sigma"])
             time_ns = default_ns if values["time"] is None else values["time"]
             self.rows.integers.extend((time_ns, raw.log_time_ns, raw.sequence, self.counts["messages"]))
             self.rows.floats.extend((_number(first), _number(second), _number(z), _number(values["score"]), *covariance))
@@ -202,11 +177,12 @@ class ChannelReader:
 
     def field_columns(self) -> FieldColumns:
         """What reads the source's fields of many messages at once; `UndecodableChannel` where that cannot be done."""
-        if self.alternatives != "first":
-            raise UndecodableChannel(f"{self.channel.topic}: holds several positions a message")
+        if self.alternatives != "first" or self.json_text or self.conditions.name_constants:
+            raise UndecodableChannel(f"{self.channel.topic}: only a decoded message says what is to be used of it")
         readers = dict(zip(_COLUMNS, self.positions[0], strict=True)) | self.fields
-        columns = FieldColumns(self.channel, {name: reader.paths for name, reader in readers.items()})
-        if not {"first", "second"} | {name for name, reader in readers.items() if reader.is_needed} <= columns.names:
+        columns = FieldColumns(self.channel, {name: reader.paths for name, reader in readers.items()} | self.conditions.paths)
+        needed = {"first", "second"} | {name for name, reader in readers.items() if reader.is_needed}
+        if not needed | (set(self.conditions.paths) if self.conditions.is_stated else set()) <= columns.names:
             raise UndecodableChannel(f"{self.channel.topic}: lacks a field")
         return columns
 
@@ -216,22 +192,18 @@ class ChannelReader:
         self.counts["messages"] += len(batch)
         for name, reader in zip((*_COLUMNS, *self.fields), (*self.positions[0], *self.fields.values()), strict=True):
             reader.is_found = reader.is_found or name in columns
-        has_fix = np.ones(len(batch), np.bool_)
-        if "status" in columns:
-            has_fix &= ~(columns["status"] < 0)
-        if "flags" in columns:
-            has_fix &= columns["flags"] % 2 != 0
-        num_rows = int(has_fix.sum())
-        self.counts["no_fix"] += len(batch) - num_rows
-        columns = {name: column[has_fix] for name, column in columns.items()}
-        log_time_ns, sequence = batch.log_time_ns[has_fix], batch.sequence[has_fix]
-        time_ns = batch.publish_time_ns[has_fix].astype(np.int64) if self.source.time == PUBLISH_TIME else log_time_ns
+        is_used = self.conditions.hold_in(columns, len(batch))
+        num_rows = int(is_used.sum())
+        self.counts[self._unmet] += len(batch) - num_rows
+        columns = {name: column[is_used] for name, column in columns.items()}
+        log_time_ns, sequence = batch.log_time_ns[is_used], batch.sequence[is_used]
+        time_ns = batch.publish_time_ns[is_used].astype(np.int64) if self.source.time == PUBLISH_TIME else log_time_ns
         if "time" in columns:
             time_ns = np.where(columns["time"] == 0, time_ns, columns["time"])
         absent = np.full(num_rows, math.nan)
         numbers = [columns.get(name, absent) for name in (*_COLUMNS, "score")]
         self.rows.integers.frombytes(
-            np.column_stack([time_ns, log_time_ns, sequence, message[has_fix]]).astype(np.int64).tobytes()
+            np.column_stack([time_ns, log_time_ns, sequence, message[is_used]]).astype(np.int64).tobytes()
         )
         self.rows.floats.frombytes(np.column_stack([*numbers, self._covariances(columns, num_rows)]).tobytes())
         for kind, names in (("agent", self.rows.agents), ("sensor", self.rows.sensors)):
@@ -247,10 +219,22 @@ class ChannelReader:
             if readers[0].is_needed and self.counts["messages"] and not any(reader.is_found for reader in readers):
                 where = f"extract.{self.role}, topic {self.channel.topic}"
                 raise ConfigError(f"{where}: no message has {readers[0].problem}; correct the [extract] entry")
+        if self.conditions.is_stated and self.conditions.missing and self.counts["messages"] > self.counts["incomplete"]:
+            where = f"extract.{self.role}, topic {self.channel.topic}"
+            raise ConfigError(f"{where}: no message has {self.conditions.missing}; correct `where` in the [extract] entry")
 
     def finish(self) -> Positions:
         """All rows read."""
-        return self.rows.finish(self.channel.topic, self.is_geodetic, self.source.frame_convention == "ned", self.is_stated)
+        rows = self.rows.finish(self.channel.topic, self.is_geodetic, self.is_ned, self.is_stated)
+        if not self.is_north_first:
+            return rows
+        covariance_m2, height_covariance_m2 = rows.covariance_m2[:, [2, 1, 0]], rows.height_covariance_m2[:, [1, 0, 2]]
+        return replace(rows, covariance_m2=covariance_m2, height_covariance_m2=height_covariance_m2)
+
+    @property
+    def _unmet(self) -> str:
+        """How positions are counted that the conditions leave out."""
+        return "unmet" if self.conditions.is_stated else "no_fix"
 
     def _points(self, message: Any) -> list[Point] | None:
         """All positions in a message; None where no path leads to any."""
@@ -272,28 +256,28 @@ class ChannelReader:
         self.counts["incomplete"] += len(firsts.keys() | seconds.keys()) - len(points)
         return points
 
-    def _has_no_fix(self, values: Mapping[str, Any]) -> bool:
-        status, flags = values["status"], values["flags"]
-        return (status is not None and _number(status) < 0) or (isinstance(flags, int) and flags % 2 == 0)
-
-    def _covariance(self, matrix: Any, kind: Any) -> Covariance:
-        """What is unknown takes the source's sigma_m; so does what is no covariance, which is counted."""
-        if matrix is None or kind == 0 or (isinstance(kind, str) and "UNKNOWN" in kind):
-            return self.unknown
-        try:
-            return stated_covariance(matrix) or self.unknown
-        except (LookupError, TypeError, ValueError, OverflowError):
-            self.counts["bad_covariance"] += 1
-            return self.unknown
+    def _covariance(self, matrix: Any, kind: Any, sigma_m: Any) -> Covariance:
+        """What is unknown takes the stated accuracy, else the source's sigma_m; so does what is none, which is counted."""
+        if matrix is not None and kind != 0 and not (isinstance(kind, str) and "UNKNOWN" in kind):
+            try:
+                if (stated := stated_covariance(matrix)) is not None:
+                    return stated
+            except (LookupError, TypeError, ValueError, OverflowError):
+                self.counts["bad_covariance"] += 1
+        return stated_sigma(_number(sigma_m)) or self.unknown
 
     def _covariances(self, columns: Mapping[str, Column], num_rows: int) -> Float64s:
         """`_covariance` [N, 6] of many messages at once."""
+        unknown = np.tile(np.array(self.unknown), (num_rows, 1))
+        if "sigma" in columns:
+            stated = [stated_sigma(sigma_m) or self.unknown for sigma_m in columns["sigma"].tolist()]
+            unknown = np.array(stated, np.float64).reshape(-1, 6)
         if "covariance" not in columns:
-            return np.tile(np.array(self.unknown), (num_rows, 1))
+            return unknown
         covariances, is_stated, is_bad = stated_covariances(columns["covariance"])
         says_something = columns["covariance_type"] != 0 if "covariance_type" in columns else np.ones(num_rows, np.bool_)
         self.counts["bad_covariance"] += int((is_bad & says_something).sum())
-        return np.where((is_stated & says_something)[:, None], covariances, np.array(self.unknown))
+        return np.where((is_stated & says_something)[:, None], covariances, unknown)
 
     def _identity(self, kind: str, value: Any, place: Place) -> str | None:
         """Constant, from a field, or None; truth and poses need a name, so theirs is at last the topic's (and the place)."""
@@ -314,8 +298,16 @@ def _frame_name(value: Any) -> str | None:
 _COLUMNS = ("first", "second", "z")
 _METRIC = ("x", "y", "z")
 _GEODETIC = ("latitude", "longitude", "altitude")
-_OTHERS = ("covariance", "covariance_type", "status", "flags", "time", "frame_id", "agent", "sensor", "score")
+_OTHERS = ("covariance", "covariance_type", "sigma", "time", "frame_id", "agent", "sensor", "score")
 _CONVERSIONS: Mapping[str, Callable[[Any], Any]] = {"time": stamp_ns, "frame_id": _frame_name}
+
+
+def _opened(message: Any, name: str) -> Any:
+    """What the text of a field says, which is JSON; nothing where it is none."""
+    try:
+        return json.loads(message[name] if isinstance(message, dict) else getattr(message, name))
+    except (KeyError, AttributeError, TypeError, ValueError, RecursionError):
+        return {}
 
 
 def _number(value: Any) -> float:

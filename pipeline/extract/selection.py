@@ -7,8 +7,7 @@ from cadence.errors import ConfigError, InputError, NothingDetectedError
 from pipeline.extract.positions import ChannelReader
 from pipeline.extract.thinning import ThinningConfig
 from pipeline.logs.reader import Channel
-from pipeline.mapping.guess import SuggestedMapping, dense_sources, describe_channels, suggest_mapping
-from pipeline.mapping.presets import preset_for
+from pipeline.mapping.guess import SuggestedMapping, dense_sources, describe_channels, suggest_mapping, usable_preset
 from pipeline.mapping.sources import SourceConfig
 
 ROLES = ("detections", "truth", "poses")
@@ -59,8 +58,23 @@ def select_readers(
     readers = []
     for role in ROLES:
         for source in chosen[role]:
-            readers += _readers(role, source, bool(stated[role]), channels)
+            readers += _readers(role, source, chosen[role], bool(stated[role]), channels)
     return tuple(readers)
+
+
+def unused_channels(readers: Sequence[ChannelReader], channels: Sequence[Channel]) -> dict[str, str]:
+    """Why channels that may hold detections are read for no role, as `/topic (Type)` and the reason."""
+    suggested, taken = suggest_mapping(channels), {reader.channel.id for reader in readers}
+    is_stated = any(reader.role == "detections" and reader.is_stated for reader in readers)
+    others = "[[extract.detections]] names others" if is_stated else "detections are thinned out of another channel"
+    found = {}
+    for channel in channels:
+        why = suggested.unused.get(channel.topic)
+        if why is None and suggested.roles.get(channel.topic) == "detections" and channel.message_count != 0:
+            why = others
+        if why is not None and channel.id not in taken:
+            found[describe_channels([channel])] = why
+    return found
 
 
 def _topics(sources: Sequence[SourceConfig], channels: Sequence[Channel]) -> set[str]:
@@ -89,13 +103,33 @@ def _dense(
     return dense
 
 
-def _readers(role: str, source: SourceConfig, is_stated: bool, channels: Sequence[Channel]) -> list[ChannelReader]:
+def _readers(
+    role: str, source: SourceConfig, sources: Sequence[SourceConfig], is_stated: bool, channels: Sequence[Channel]
+) -> list[ChannelReader]:
+    """A reader for every channel that `source`, one of `sources`, means."""
     named = [(channel, found) for channel in channels if (found := source.match(channel.topic)) is not None]
     if not named:
         raise ConfigError(
             f"extract.{role}: no topic of the log is {source.topic!r}; topics: {describe_channels(channels)}; correct the entry"
         )
-    return [ChannelReader(channel, source, role, is_stated, found) for channel, found in named]
+    return [
+        ChannelReader(channel, source, role, is_stated, found)
+        for channel, found in named
+        if source.preset in (None, usable_preset(channel)) or not _is_left_out(channel, source, sources, is_stated, channels)
+    ]
+
+
+def _is_left_out(
+    channel: Channel, source: SourceConfig, sources: Sequence[SourceConfig], is_stated: bool, channels: Sequence[Channel]
+) -> bool:
+    """Whether a channel of another type than the preset of `source`, whose topic means it, is not for that source.
+
+    Topics of several types may fit one pattern, and one topic may have several types. A preset that the user states for another
+    type is tried only where no channel is of its own type, and no other source is for the channel's.
+    """
+    own = usable_preset(channel)
+    is_for_others = any(usable_preset(other) == source.preset and source.match(other.topic) is not None for other in channels)
+    return not is_stated or is_for_others or any(s.preset == own and s.match(channel.topic) is not None for s in sources)
 
 
 def _named(suggested: SuggestedMapping, channels: Sequence[Channel]) -> list[Channel]:
@@ -106,13 +140,13 @@ def _named(suggested: SuggestedMapping, channels: Sequence[Channel]) -> list[Cha
 def _are_silent(suggested: SuggestedMapping, channels: Sequence[Channel]) -> bool:
     """Whether there are channels of detections, all of a known type, on which nothing was recorded."""
     named = _named(suggested, channels)
-    return bool(named) and all(preset_for(channel.schema_name) is not None for channel in named)
+    return bool(named) and all(usable_preset(channel) is not None for channel in named)
 
 
 def _no_detections(suggested: SuggestedMapping, channels: Sequence[Channel]) -> str:
     """One line: what is there, and the lines that would make detections of it."""
     named = _named(suggested, channels)
-    unread = sorted({channel.topic for channel in named if preset_for(channel.schema_name) is None})
+    unread = sorted({channel.topic for channel in named if usable_preset(channel) is None})
     if _are_silent(suggested, channels):
         return f"no message was recorded on {describe_channels(named)}; name other topics under [[extract.detections]]"
     if unread:

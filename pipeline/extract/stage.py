@@ -26,7 +26,7 @@ from pipeline.extract.placement import Placing, bring_together, in_enu, mission_
 from pipeline.extract.plausibility import Kind, Suspicions, few
 from pipeline.extract.positions import ChannelReader, Positions, Rows
 from pipeline.extract.reading import read_positions
-from pipeline.extract.selection import ROLES, select_readers, selected_channels
+from pipeline.extract.selection import ROLES, select_readers, selected_channels, unused_channels
 from pipeline.extract.spikes import is_spike
 from pipeline.extract.stamps import moment_ns
 from pipeline.extract.stretches import without_set_back, without_unjoined
@@ -144,7 +144,10 @@ def write_tables(log: MissionLog, folder: Path, config: ExtractConfig, progress:
         write_table(_track_table(log_id, poses, "sensor_id", poses.sensor, POSES), folder / "poses.parquet", "poses", frame)
     obstacles = collect_obstacles(log, config.obstacles, frame, progress.note)
     write_obstacles(folder / OBSTACLES_NAME, obstacles)
+    unused = unused_channels(readers, channels)
     tell(counts, suspicions, detections.positions, log, progress)
+    for channel, why in unused.items():
+        progress.note(f"extract: {channel} may hold detections and is not used: {why}")
     transforms.tell()
     if frame.frame_id.lower().endswith("ned"):
         progress.note(
@@ -154,7 +157,7 @@ def write_tables(log: MissionLog, folder: Path, config: ExtractConfig, progress:
         refused = "; ".join(few(suspicions.lines()))
         raise ImplausibleInputError(f"{log.path}: refused by --strict, as something in it is suspected: {refused}")
     summary = summarise(log, readers, detections.positions, truth, poses, frame, counts, suspicions, len(obstacles))
-    return summary | {"transforms": transforms.summary(counts)}
+    return summary | {"unused": unused, "transforms": transforms.summary(counts)}
 
 
 @contextlib.contextmanager
@@ -235,6 +238,8 @@ def _check_any(role: str, rows: Positions, counts: Counter[str]) -> None:
         reason = "every position is NaN, infinite or off the earth; check the recorder, or map another topic"
     elif counts["undecodable"]:
         reason = "no message of the mapped topics can be decoded; map another topic (cadence info lists them)"
+    elif counts["unmet"]:
+        reason = "no position meets the conditions of `where`; correct the [extract] entries"
     elif counts["no_fix"]:
         reason = "every position is marked as having no fix; map another topic (cadence info lists them)"
     elif counts["incomplete"]:

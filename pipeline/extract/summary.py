@@ -22,7 +22,8 @@ def tell(counts: Counter[str], suspicions: Suspicions, detections: Positions, lo
         "dropped_nonfinite": "positions are NaN, infinite or off the earth and were skipped",
         "incomplete": "messages have no position where the mapping looks for it and were skipped",
         "undecodable": "messages cannot be decoded and were skipped",
-        "no_fix": "positions are marked as having no fix and were skipped",
+        "no_fix": "positions are marked as having no fix, or as not valid, and were skipped",
+        "unmet": "positions do not meet the conditions of `where` and were skipped",
         "bad_covariance": "covariances are not positive definite and were replaced by the default",
         "out_of_order": "time stamps were out of order and were sorted",
         "spikes": "positions lie far off their track (see extract.max_speed_mps) and were skipped",
@@ -51,7 +52,16 @@ def summarise(
     """The numbers of the stage."""
     agents = {agent for agent in detections.agent if agent is not None}
     span_s = float(detections.time_ns[-1] - detections.time_ns[0]) * 1e-9
-    names = ("undecodable", "incomplete", "no_fix", "dropped_nonfinite", "bad_covariance", "out_of_order", "outside_time_cut")
+    names = (
+        "undecodable",
+        "incomplete",
+        "no_fix",
+        "unmet",
+        "dropped_nonfinite",
+        "bad_covariance",
+        "out_of_order",
+        "outside_time_cut",
+    )
     return {
         "num_detections": len(detections),
         "num_truth": len(truth),

@@ -1,8 +1,8 @@
 """Messages that tell where frames are → the links of a transform tree.
 
-Read are tf2_msgs/TFMessage and its kin, foxglove.FrameTransform(s), and nav_msgs/Odometry, which tells where its child frame
-is. ROS marks what never moves by the topic /tf_static, and such a transform holds from the first to the last moment of the
-log wherever in it it stands; Foxglove has no such mark, so there a transform that never changes is static.
+Read are tf2_msgs/TFMessage and its kin, foxglove.FrameTransform(s), and Odometry of ROS and Foxglove, which tells where its
+child frame is. ROS marks what never moves by the topic /tf_static, and such a transform holds from the first to the last moment
+of the log wherever in it it stands; Foxglove has no such mark, so there a transform that never changes is static.
 """
 
 import math
@@ -13,6 +13,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from pipeline.extract.clocks import Stamps
+from pipeline.extract.field_reader import FieldReader
 from pipeline.extract.mission_clock import MissionClock
 from pipeline.extract.stamps import stamp_ns
 from pipeline.extract.transforms import Link, TransformTree, tree_of
@@ -28,7 +29,7 @@ Kind = Literal["static", "moving", "unmarked", "vehicle"]
 
 _ROS = ("header.stamp", "header.frame_id", "child_frame_id", "transform.translation", "transform.rotation")
 _FOXGLOVE = ("timestamp", "parent_frame_id", "child_frame_id", "translation", "rotation")
-_FORMS = {  # time, parent, child, translation, rotation; before them where in the message, if there are several
+_FORMS = {  # time, parent, child (| between alternatives), translation, rotation; before them where there are several
     "tf2_msgs.TFMessage": ("transforms[:]", *_ROS),
     "tf.tfMessage": ("transforms[:]", *_ROS),
     "geometry_msgs.TransformStamped": ("", *_ROS),
@@ -42,6 +43,7 @@ _FORMS = {  # time, parent, child, translation, rotation; before them where in t
         "pose.pose.position",
         "pose.pose.orientation",
     ),
+    "foxglove.Odometry": ("", "timestamp", "frame_id", "body_frame_id|child_frame_id", "pose.position", "pose.orientation"),
 }
 
 
@@ -79,7 +81,7 @@ class _Reader:
         self.channel, self.kind, self.samples, self.counts = channel, kind, samples, counts
         self.decode = decoder_for(channel)
         self._items = parse_path(items) if items else None
-        self._paths = [parse_path(path) for path in paths]
+        self._paths = [FieldReader(path.split("|")) for path in paths]
 
     def read(self, raw: RawMessage) -> None:
         """Add the transforms of one message."""
@@ -97,7 +99,7 @@ class _Reader:
 
     def _add(self, item: Any, log_time_ns: int) -> None:
         """`ValueError` and the like where a field is absent or no number."""
-        stamp, parent, child, translation, rotation = (path.located(item)[()] for path in self._paths)
+        stamp, parent, child, translation, rotation = ((path.located(item) or {})[()] for path in self._paths)
         parent, child = parent.lstrip("/"), child.lstrip("/")
         if self.kind == "vehicle" and not child:
             return  # it tells of itself, and not of a frame

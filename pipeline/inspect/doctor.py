@@ -28,7 +28,7 @@ _MEANING: Mapping[Verdict, str] = {
 _LEFT_OUT = {
     "undecodable": "messages cannot be decoded",
     "incomplete": "messages have no position where it is looked for",
-    "no_fix": "positions are marked as having no fix",
+    "no_fix": "positions are marked as having no fix, or as not valid",
     "dropped_nonfinite": "positions are NaN, infinite or off the earth",
     "spikes": "positions lie far off their track",
     "other_frame": "positions are in another frame that no transform joins",
@@ -185,7 +185,8 @@ def _use_lines(diagnosis: Diagnosis) -> list[str]:
     for role, name in (("truth", "num_truth"), ("poses", "num_poses")):
         if use[name]:
             counts.append(f"{use[name]} positions of {role}{_topics(use, role)}")
-    return counts + [f"left out: {use[name]} {words}" for name, words in _LEFT_OUT.items() if use[name]]
+    counts += [f"left out: {use[name]} {words}" for name, words in _LEFT_OUT.items() if use[name]]
+    return counts + [f"not used, though it may hold detections: {channel}: {why}" for channel, why in use["unused"].items()]
 
 
 def _topics(use: Mapping[str, Any], role: str) -> str:

@@ -7,10 +7,11 @@ import itertools
 import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Final, Literal
 
-from pipeline.mapping.presets import NAMES_AGENTS, normalise_schema, preset_for
+from pipeline.mapping.field_paths import coordinate_paths
+from pipeline.mapping.presets import PRESETS, SETPOINTS, normalise_schema, preset_for
 from pipeline.mapping.sources import ChannelLike, SourceConfig
 
 Role = Literal["detections", "truth", "poses", "positions", "tf", "obstacles"]
@@ -26,6 +27,12 @@ _POSE = {
     "sensor", "sensors", "ownship", "own", "ego", "platform", "platforms", "observer", "observers",
 }  # fmt: skip
 _KNOWN: Final = _TRUTH | _DETECTION | _POSE | {"ground"}
+# Where a vehicle is told to be is not where anything is.
+_SETPOINT = {"setpoint", "setpoints", "goal", "goals", "cmd", "command", "commanded", "desired", "waypoint", "waypoints"}
+_MAYBE_SETPOINT = re.compile(r"target_(pose|position|point|location|local|global|odom|state)")
+"""A name that autopilots use for a set-point, and others for where the target is."""
+_ONLY_WITH: Final = {"TransformStamped": _TRUTH, "GeoJSON": _DETECTION}
+"""Presets that are not suggested but for topics with one of these words."""
 _OBSTACLE = {"obstacle", "obstacles", "map", "costmap", "grid", "keepout", "nogo"}
 _TF_SCHEMAS = {"TFMessage", "tfMessage", "TransformStamped", "FrameTransform", "FrameTransforms"}
 _OBSTACLE_SCHEMAS = {"OccupancyGrid", "Grid", "GeoJSON"}
@@ -33,18 +40,25 @@ OWN_TOPICS = "/cadence/"
 """What an earlier run wrote into a combined file is never an input."""
 # Without a preset only a name as plain as this makes a detection: /radar/image or /battery/report are none.
 _PLAIN_DETECTION = {"contact", "contacts", "detection", "detections", "target", "targets", "sighting", "sightings"}
+_DETECTION_TYPE = re.compile(r"Detection|Detected|Track(?!er)|Object|Contact|Targets|Sighting|Radar|BoundingBox|AIS|Ais|ADSB")
 _NEVER_POSITIONS = {"std_msgs", "sensor_msgs", "rcl_interfaces", "diagnostic_msgs", "visualization_msgs"}
 
 
 @dataclass(frozen=True)
 class SuggestedMapping:
-    """What the channels look like. `roles` maps topics to roles; the sources hold only channels with a preset."""
+    """What the channels look like. `roles` maps topics to roles; the sources hold only channels with a preset.
+
+    `unread` are detections of types that no preset knows, with paths that may fit; `unused` all topics that may hold
+    detections and are in no source, and why they are not.
+    """
 
     roles: Mapping[str, Role]
     detections: tuple[SourceConfig, ...] = ()
     truth: tuple[SourceConfig, ...] = ()
     poses: tuple[SourceConfig, ...] = ()
     positions: tuple[SourceConfig, ...] = ()
+    unread: tuple[SourceConfig, ...] = ()
+    unused: Mapping[str, str] = field(default_factory=dict)
 
     def to_toml(self) -> str:
         """The `[extract]` lines of this mapping, ready to paste; what needs a decision is a comment."""
@@ -52,10 +66,9 @@ class SuggestedMapping:
         for source in self.positions:
             comment = "a position, but the name does not tell of what: make it detections, truth or poses"
             blocks.append("# " + f"{comment}\n{_entry('detections', source)}".replace("\n", "\n# "))
-        for topic, role in self.roles.items():
-            if role == "detections" and not any(source.match(topic) is not None for source in self.detections):
-                entry = _entry("detections", SourceConfig(topic, x="position.x", y="position.y"))
-                blocks.append("# " + f"no preset knows its schema: give the paths of its fields\n{entry}".replace("\n", "\n# "))
+        for source in self.unread:
+            entry = _entry("detections", source)
+            blocks.append("# " + f"no preset knows its schema: give the paths of its fields\n{entry}".replace("\n", "\n# "))
         if blocks and not self.detections:
             blocks.append("# to make sparse detections out of the dense channel:\n# [extract.thinning]\n# enabled = true")
         return "\n\n".join(blocks) + ("\n" if blocks else "")
@@ -64,9 +77,12 @@ class SuggestedMapping:
 def suggest_mapping(channels: Sequence[ChannelLike]) -> SuggestedMapping:
     """The roles that names and schemas suggest, and sources for the channels that have messages and a preset."""
     roles = {channel.topic: role for channel in channels if (role := _role(channel)) is not None}
+    doubtful = [topic for topic, role in roles.items() if role == "detections" and _may_be_setpoint(topic)]
+    if len(doubtful) < sum(role == "detections" for role in roles.values()):
+        roles = {topic: role for topic, role in roles.items() if topic not in doubtful}
 
     def readable(role: Role) -> list[ChannelLike]:
-        return [c for c in channels if roles.get(c.topic) == role and preset_for(c.schema_name) and c.message_count != 0]
+        return [c for c in channels if roles.get(c.topic) == role and usable_preset(c) and c.message_count != 0]
 
     return SuggestedMapping(
         roles,
@@ -74,12 +90,23 @@ def suggest_mapping(channels: Sequence[ChannelLike]) -> SuggestedMapping:
         truth=_sources(readable("truth"), "truth"),
         poses=_sources(readable("poses"), "poses"),
         positions=_sources(readable("positions"), "positions"),
+        unread=tuple(_unread_source(c) for c in channels if roles.get(c.topic) == "detections" and not usable_preset(c)),
+        unused={c.topic: why for c in channels if c.message_count != 0 and (why := _why_unused(c, roles.get(c.topic)))},
     )
+
+
+def usable_preset(channel: ChannelLike) -> str | None:
+    """The name of the preset by which a channel can be read without being told; None where there is none."""
+    words = _words(channel.topic)
+    name = preset_for(channel.schema_name) or ("AIS" if not channel.schema_name and "ais" in words else None)
+    if name is None or PRESETS[name].is_suggested or _ONLY_WITH.get(name, set()).intersection(words):
+        return name
+    return None
 
 
 def dense_sources(channels: Sequence[ChannelLike], suggested: SuggestedMapping) -> tuple[SourceConfig, ...]:
     """Poses and positions as sources of truth, for a log whose only position channel is the one to thin."""
-    usable = [c for c in channels if suggested.roles.get(c.topic) in ("poses", "positions") and preset_for(c.schema_name)]
+    usable = [c for c in channels if suggested.roles.get(c.topic) in ("poses", "positions") and usable_preset(c)]
     return _sources([c for c in usable if c.message_count != 0], "truth")
 
 
@@ -98,51 +125,89 @@ def _words(topic: str) -> list[str]:
 def _role(channel: ChannelLike) -> Role | None:
     """Schema first, then the words of the name; truth before detection, detection before pose (`/truth/target/pose`)."""
     package, _, kind = normalise_schema(channel.schema_name).rpartition(".")
-    words, preset = _words(channel.topic), preset_for(channel.schema_name)
-    if kind in _TF_SCHEMAS:
+    words, preset = _words(channel.topic), usable_preset(channel)
+    if kind in _TF_SCHEMAS and preset is None:
         return "tf"
-    if kind in _OBSTACLE_SCHEMAS or (preset == "SceneUpdate" and _OBSTACLE.intersection(words)):
+    if (kind in _OBSTACLE_SCHEMAS and preset is None) or (preset == "SceneUpdate" and _OBSTACLE.intersection(words)):
         return "obstacles"
-    if channel.topic.startswith(OWN_TOPICS):
+    if channel.topic.startswith(OWN_TOPICS) or _is_setpoint(channel):
         return None
     if preset is None:
-        if _PLAIN_DETECTION.intersection(words) and package not in _NEVER_POSITIONS:
+        if preset_for(channel.schema_name) is not None or package in _NEVER_POSITIONS:
+            return None  # only when told
+        if _PLAIN_DETECTION.intersection(words):
             return "detections"
-        return "obstacles" if _OBSTACLE.intersection(words) and package not in _NEVER_POSITIONS else None
+        return "obstacles" if _OBSTACLE.intersection(words) else None
     if _TRUTH.intersection(words) or ("ground", "truth") in itertools.pairwise(words):
         return "truth"
-    if _DETECTION.intersection(words) or preset == "Detection" or (preset in NAMES_AGENTS and preset != "SceneUpdate"):
-        return "detections"
+    if PRESETS[preset].role is not None or _DETECTION.intersection(words):
+        return PRESETS[preset].role or "detections"
     if preset == "SceneUpdate":
         return None  # a scene without such a name may show anything
     return "poses" if _POSE.intersection(words) else "positions"
 
 
+def _is_setpoint(channel: ChannelLike) -> bool:
+    return normalise_schema(channel.schema_name) in SETPOINTS or not _SETPOINT.isdisjoint(_words(channel.topic))
+
+
+def _may_be_setpoint(topic: str) -> bool:
+    parts = topic.split("/")
+    doubtful = [part for part in parts if _MAYBE_SETPOINT.fullmatch(part)]
+    return bool(doubtful) and all(_DETECTION.isdisjoint(_words(part)) for part in parts if part not in doubtful)
+
+
+def _why_unused(channel: ChannelLike, role: Role | None) -> str | None:
+    """Why a channel that may hold detections is in no source; None for all others."""
+    kind = normalise_schema(channel.schema_name).rpartition(".")[2]
+    has_name, has_type = not _PLAIN_DETECTION.isdisjoint(_words(channel.topic)), _DETECTION_TYPE.search(kind) is not None
+    if role not in (None, "detections") or channel.topic.startswith(OWN_TOPICS) or not (has_name or has_type):
+        return None
+    if usable_preset(channel) is not None and role == "detections":
+        return None
+    if _is_setpoint(channel) or _may_be_setpoint(channel.topic):
+        return "it may be where a vehicle is told to go"
+    if preset_for(channel.schema_name) is not None:
+        return "what is drawn may be anything"
+    return "no preset knows its type"
+
+
+def _unread_source(channel: ChannelLike) -> SourceConfig:
+    """An entry for a channel of a type that no preset knows, with paths out of its schema where it has any that fit."""
+    first, second = coordinate_paths(channel.schema_name, channel.schema_data) or ("position.x", "position.y")
+    if first.rpartition(".")[2].startswith("lat"):
+        return SourceConfig(channel.topic, latitude=first, longitude=second)
+    is_ned = normalise_schema(channel.schema_name).startswith("px4_msgs.")
+    return SourceConfig(channel.topic, x=first, y=second, frame_convention="ned" if is_ned else None)
+
+
 def _sources(channels: Sequence[ChannelLike], role: Role) -> tuple[SourceConfig, ...]:
     """One source a pattern: topics of one preset that differ only in a name share it."""
     topics = [channel.topic for channel in channels]
-    found = {(_pattern(c.topic, role, topics), preset_for(c.schema_name)): None for c in channels}
+    found = {(_pattern(c, role, topics), usable_preset(c)): None for c in channels}
     return tuple(SourceConfig(pattern, preset=preset) for pattern, preset in found)
 
 
-def _pattern(topic: str, role: Role, topics: Sequence[str]) -> str:
-    """Put placeholders where names stand beside words of roles.
+def _pattern(channel: ChannelLike, role: Role, topics: Sequence[str]) -> str:
+    """The topic with placeholders where names stand beside words of roles.
 
     /truth/A7 → /truth/{agent}, /cub1/pose → /{agent}/pose; of a detection the name before the word is who sees, the name
-    after it who is seen: /camera/contacts/A7 → /{sensor}/contacts/{agent}. Names in `topics` tell which part varies.
+    after it who is seen: /camera/contacts/A7 → /{sensor}/contacts/{agent}. Names in `topics` tell which part varies. Messages
+    that name agents themselves need no name of the topic.
     """
-    parts = topic.split("/")
+    parts = channel.topic.split("/")
+    needs_agent = not _names_agents(channel)
     is_word = [bool(part) and not _KNOWN.isdisjoint(_words(part)) for part in parts]
     names = [i for i, part in enumerate(parts) if part and not is_word[i]]
     if not any(is_word) or not names:
-        return topic
+        return channel.topic
     varying = _varying(parts, names, topics)
     if role == "detections":
         word = max(i for i, known in enumerate(is_word) if known)
         for placeholder, places in (("sensor", [i for i in names if i < word]), ("agent", [i for i in names if i > word])):
-            if places:
+            if places and (placeholder == "sensor" or needs_agent):
                 parts[next((i for i in reversed(places) if i in varying), places[-1])] = f"{{{placeholder}}}"
-    else:
+    elif role == "poses" or needs_agent:
         parts[varying[-1] if varying else names[-1]] = "{sensor}" if role == "poses" else "{agent}"
     return "/".join(parts)
 
@@ -167,11 +232,16 @@ def _name_only_agent(
         for c in truth
         if (found := source.match(c.topic))
     ]
-    if len(truth) != 1 or len(named) != 1:
+    if len(truth) != 1 or len(named) != 1 or _names_agents(truth[0]):
         return detections
-    identified = {c.topic for c in channels if b"agent_id" in c.schema_data or preset_for(c.schema_name) in NAMES_AGENTS}
+    identified = {c.topic for c in channels if b"agent_id" in c.schema_data or _names_agents(c)}
     is_named = [source.topic in identified or "{agent}" in source.topic for source in detections]
     return tuple(s if known else replace(s, agent=named[0]) for s, known in zip(detections, is_named, strict=True))
+
+
+def _names_agents(channel: ChannelLike) -> bool:
+    preset = usable_preset(channel)
+    return preset is not None and PRESETS[preset].names_agents
 
 
 def _entry(role: str, source: SourceConfig) -> str:

@@ -2,7 +2,8 @@
 
 The topic is not part of a path here. Fields by name (quoted where they hold other characters), `[i]` with negative indices
 from the end, `[a:b]` with both ends included (as Foxglove has it, unlike Python), filters `{field==value}`
-(`== != < <= > >=`; several mean "and") that keep the matching items, and at the end functions of numbers (`.@mul(1e-7)`).
+(`== != < <= > >=`, and of our own `&`: has one of these bits; several mean "and") that keep the matching items, and at the
+end functions of numbers (`.@mul(1e-7)`).
 A value in a filter is a number, true, false, text, or the name of a constant (`{type==KNOWN}`).
 
 A path finds values at places: a place has a number for each slice of the path, the item's index. So values of different
@@ -22,7 +23,7 @@ Place = tuple[int, ...]
 _FIELD = re.compile(r'"([^"]+)"|([A-Za-z_][\w\-]*)')
 _FUNCTION = re.compile(r"@(\w+)(?:\(\s*([^()]*?)\s*\))?")
 _BRACKET = re.compile(r"\[(-?\d*)(:?)(-?\d*)\]")
-_FILTER = re.compile(r"""\{\s*([A-Za-z_][\w\-.]*)\s*(==|!=|<=|>=|<|>)\s*("[^"]*"|'[^']*'|[^{}"']+?)\s*\}""")
+_FILTER = re.compile(r"""\{\s*([A-Za-z_][\w\-.]*)\s*(==|!=|<=|>=|<|>|&)\s*("[^"]*"|'[^']*'|[^{}"']+?)\s*\}""")
 _OPERATORS: Mapping[str, Callable[[Any, Any], bool]] = {
     "==": operator.eq,
     "!=": operator.ne,
@@ -30,6 +31,7 @@ _OPERATORS: Mapping[str, Callable[[Any, Any], bool]] = {
     ">=": operator.ge,
     "<": operator.lt,
     ">": operator.gt,
+    "&": lambda value, bits: bool(value & bits),
 }
 _PLAIN_FUNCTIONS: Mapping[str, Callable[[float], float]] = {
     "abs": abs, "negative": operator.neg, "deg2rad": math.radians, "rad2deg": math.degrees, "round": round,
@@ -119,13 +121,25 @@ class Filter:
 
     def keeps(self, item: Any) -> bool:
         """Whether an item matches; one without the field, or of another type, does not."""
+        verdict = self.verdict(item)
+        return self.symbol == "!=" if verdict is None else verdict
+
+    def verdict(self, item: Any) -> bool | None:
+        """Whether an item matches; None where it lacks the field."""
         parent = item
         try:
             for name in self.names:
                 parent, item = item, _field(item, name)
-            value = self._constant(parent, item) if isinstance(self.value, str) and isinstance(item, int) else self.value
+        except MissingFieldError:
+            return None
+        is_constant = isinstance(self.value, str) and isinstance(item, int)
+        return self.compares(item, self._constant(parent, item) if is_constant else self.value)
+
+    def compares(self, item: Any, value: Any) -> bool:
+        """Whether the comparison with `value` holds for the field's value `item`."""
+        try:
             return bool(_OPERATORS[self.symbol](item, value))
-        except (MissingFieldError, TypeError):
+        except TypeError:  # of another type
             return self.symbol == "!="
 
     def _constant(self, parent: Any, item: int) -> Any:
@@ -279,10 +293,11 @@ def _filter(text: str, position: int) -> tuple[Step, int]:
         raise _wrong(text, position, 'expected a filter such as {score>=0.5} or {kind=="ship"}')
     if match[3].startswith("$"):
         raise _wrong(text, position, f"variables such as {match[3]} are not known here; expected a value")
-    return Filter(tuple(match[1].split(".")), match[2], _literal(match[3])), match.end()
+    return Filter(tuple(match[1].split(".")), match[2], parse_literal(match[3])), match.end()
 
 
-def _literal(text: str) -> str | float | bool:
+def parse_literal(text: str) -> str | float | bool:
+    """The value that a filter compares with: true or false, a number, or text with or without quotes."""
     if text in ("true", "false"):
         return text == "true"
     if len(text) >= 2 and text[0] == text[-1] and text[0] in "\"'":

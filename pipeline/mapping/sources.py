@@ -1,13 +1,15 @@
 """Sources: which topic and which of its fields hold detections, truth or poses, as the user configures them."""
 
 import re
-from collections.abc import Mapping
-from dataclasses import dataclass, fields
-from typing import Literal, Protocol
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields, replace
+from typing import Any, Literal, Protocol
 
 from cadence.errors import ConfigError
+from pipeline.mapping.conditions import parse_conditions
 from pipeline.mapping.message_path import parse_path
-from pipeline.mapping.presets import FRAME_PATHS, PRESETS, TIME_PATHS, Preset, preset_for
+from pipeline.mapping.preset import PATHS, Preset
+from pipeline.mapping.presets import PRESETS, preset_for
 
 PLACEHOLDERS = ("agent", "sensor")
 LOG_TIME = "log_time"
@@ -17,7 +19,8 @@ PATH_KEYS = {"agent": "agent_path", "sensor": "sensor_path"}
 """The keys of a source that state a message path under another name than the preset's field; all others are named alike."""
 
 _CHECKED = (
-    "agent_path", "sensor_path", "x", "y", "z", "latitude", "longitude", "altitude", "covariance", "score", "time", "frame_id",
+    "agent_path", "sensor_path", "x", "y", "z", "latitude", "longitude", "altitude", "covariance", "sigma", "score", "time",
+    "frame_id",
 )  # fmt: skip
 
 
@@ -46,12 +49,17 @@ class SourceConfig:
     sensor, sensor_path  who saw it
     x, y, z     message paths of a position in metres
     latitude, longitude, altitude   message paths of a position in degrees (and metres), instead of x, y and z
-    covariance  message path of 1, 4, 9 or 36 numbers (a variance, or rows of a matrix) or 6 (an upper triangle), x first, m²
-    sigma_m     standard deviation of x and y where the message states no covariance
+    where       conditions on fields of the message, all of which must hold: "fix_type >= 3 && lat_lon_valid"; the preset's are
+                used where nothing is stated, and "" means none
+    covariance  message path of 1, 4, 9 or 36 numbers (a variance, or rows of a matrix), 6 or 21 (an upper triangle) or 3 (a
+                diagonal), x first, m²
+    sigma       message path of a standard deviation of x and y, in metres, where the message states no covariance
+    sigma_m     standard deviation of x and y where the message states neither
     score       message path of a confidence
     time        message path of a stamp, or "log_time" or "publish_time"; default: the header's stamp, else the log time
     frame_id    message path of the frame's name; default: the header's
-    frame_convention   axes of x, y and z, after transforms: "enu" (east, north, up) or "ned" (north, east, down)
+    frame_convention   axes of x, y and z, after transforms: "enu" (east, north, up) or "ned" (north, east, down); default: the
+                       preset's, which is "enu" but for PX4's types
     """
 
     topic: str
@@ -67,12 +75,14 @@ class SourceConfig:
     latitude: str | None = None
     longitude: str | None = None
     altitude: str | None = None
+    where: str | None = None
     covariance: str | None = None
+    sigma: str | None = None
     sigma_m: float | None = None
     score: str | None = None
     time: str | None = None
     frame_id: str | None = None
-    frame_convention: Literal["enu", "ned"] = "enu"
+    frame_convention: Literal["enu", "ned"] | None = None
 
     def __post_init__(self) -> None:
         if self.preset is not None and self.preset not in PRESETS:
@@ -80,7 +90,9 @@ class SourceConfig:
         for name in _CHECKED:
             text = getattr(self, name)
             if text is not None and text not in (LOG_TIME, PUBLISH_TIME):
-                _check_path(name, self.without_topic(text))
+                _check(name, self.without_topic(text), parse_path)
+        if self.where:
+            _check("where", self.where, parse_conditions)
         if self.sigma_m is not None and not 0 < self.sigma_m < float("inf"):
             raise ValueError(f"topic {self.topic!r}: sigma_m must be positive")
         self._check_position()
@@ -123,19 +135,24 @@ def resolve_paths(source: SourceConfig, schema_name: str) -> Preset:
             f"topic {source.topic}: no preset for the schema {schema_name or '(none)'}; "
             "give message paths in its [extract] entry: x and y, or latitude and longitude"
         )
-    base = PRESETS[name] if name is not None else Preset((), time=TIME_PATHS, frame_id=FRAME_PATHS)
+    base = PRESETS[name] if name is not None else Preset(())
     if is_custom:  # another position must not take height or covariance from the preset's
-        base = Preset((), time=base.time, frame_id=base.frame_id, agent=base.agent, sensor=base.sensor, score=base.score)
-    paths = {item.name: getattr(base, item.name) for item in fields(Preset)}
-    for name_of_path in paths:
-        stated = getattr(source, PATH_KEYS.get(name_of_path, name_of_path), None)
-        if stated is not None:
-            paths[name_of_path] = (source.without_topic(stated),)
-    return Preset(**paths)
+        base = Preset(
+            (), time=base.time, frame_id=base.frame_id, agent=base.agent, sensor=base.sensor, score=base.score,
+            where=base.where, json_text=base.json_text,
+        )  # fmt: skip
+    stated: dict[str, Any] = {}
+    for item in fields(Preset):
+        value = getattr(source, PATH_KEYS.get(item.name, item.name), None)
+        if value is not None:
+            stated[item.name] = (source.without_topic(value),) if item.name in PATHS else value
+    if source.where is not None:
+        stated["where"] = (source.where,) if source.where else ()
+    return replace(base, **stated)
 
 
-def _check_path(name: str, text: str) -> None:
+def _check(name: str, text: str, parse: Callable[[str], object]) -> None:
     try:
-        parse_path(text)
+        parse(text)
     except ValueError as error:
         raise ValueError(f"{name}: {error}") from error

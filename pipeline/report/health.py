@@ -21,7 +21,8 @@ LEFT_OUT = {
     "collapsed": "simultaneous detections merged into others",
     "undecodable": "messages that cannot be decoded",
     "incomplete": "messages without a position where the mapping looks",
-    "no_fix": "positions marked as having no fix",
+    "no_fix": "positions marked as having no fix, or as not valid",
+    "unmet": "positions that do not meet the conditions of where",
     "dropped_nonfinite": "positions that are NaN, infinite or off the earth",
     "bad_covariance": "covariances that were replaced by the default",
     "out_of_order": "time stamps out of order, sorted",
@@ -55,8 +56,10 @@ def _extraction(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
     rows = [(text(words), text(count)) for words, count in counted.items() if count]
     if counted and not rows:
         rows = [("left out", "nothing")]
+    unused = summary.get("unused") or {}
+    rows += [("may hold detections, not used", text(f"{channel}: {why}")) for channel, why in unused.items()]
     # Other parts of the page tell of these already.
-    known = {*LEFT_OUT, "lost_spans_ns", "is_complete", "frame", "suspicions"}
+    known = {*LEFT_OUT, "lost_spans_ns", "is_complete", "frame", "suspicions", "unused"}
     return [(label(key), text(value)) for key, value in flatten(summary)[:MAX_ENTRIES] if key.split(".")[0] not in known] + rows
 
 

@@ -210,7 +210,7 @@ def test_covariances_that_are_none(tmp_path: Path) -> None:
     bad = [[1.0, 5.0, 5.0, 1.0], [0.0] * 4, [-1.0, 0.0, 0.0, 1.0], [float("nan")] * 4, [1.0, 2.0]]
     found = run(tmp_path, [detection(float(i), i, i, covariance=c) for i, c in enumerate([*bad, [2.0, 1.0, 1.0, 2.0]])])
     assert found.detections["cov_xx_m2"].to_pylist() == [None] * 5 + [2.0]
-    assert found.summary["bad_covariance"] == 2  # zeros, -1 and a wrong length say "unknown"
+    assert found.summary["bad_covariance"] == 1  # zeros, -1, NaN and a wrong length say "unknown"
 
 
 @pytest.mark.parametrize(

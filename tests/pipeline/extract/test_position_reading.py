@@ -13,6 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from mcap.writer import Writer
 
+from cadence.errors import ConfigError
 from pipeline.extract.covariances import stated_covariance, stated_covariances
 from pipeline.extract.positions import ChannelReader, Positions
 from pipeline.extract.reading import read_positions
@@ -198,6 +199,40 @@ def test_stated_paths(source: dict[str, str], tmp_path: Path, monkeypatch: pytes
     messages = [(i, odometry(i, frame=f"f{i % 3}", stamp_ns=i * 10**9 // 3)) for i in range(20)]
     (rows, _), _ = assert_same(open_log(write(tmp_path / "a.mcap", ODOMETRY, messages)), monkeypatch, **source)
     assert len(rows) == 20
+
+
+@pytest.mark.parametrize(
+    ("where", "expected"),
+    [
+        ("position_covariance_type >= 1 && status.status == 0", [50.0, 53.0]),
+        ("status.service & 1", [50.0, 51.0, 52.0, 53.0, 54.0]),
+        ('header.frame_id == "gps"', [50.0, 51.0, 52.0, 53.0, 54.0]),
+        ("latitude > 52.5", [53.0, 54.0]),
+        ("position_covariance_type == COVARIANCE_TYPE_KNOWN", []),
+        ("", [50.0, 51.0, 52.0, 53.0, 54.0]),  # not even the preset's
+    ],
+)
+def test_conditions(where: str, expected: list[float], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    messages = [(i, fix(50.0 + i, status, kind)) for i, (status, kind) in enumerate([(0, 2), (-1, 2), (1, 0), (0, 1), (-1, 0)])]
+    log = open_log(write(tmp_path / "a.mcap", FIX, messages))
+    (rows, _), counts = assert_same(log, monkeypatch, where=where)
+    assert rows.first.tolist() == expected and counts["unmet"] == 5 - len(expected)
+    assert counts["no_fix"] == 2  # of the other reader, which has the preset's
+
+
+def test_standard_deviations(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    messages = [(i, odometry(i, covariance=[9.0 * (i % 2), *[0.0] * 6, 9.0 * (i % 2), *[0.0] * 28])) for i in range(-2, 3)]
+    log = open_log(write(tmp_path / "a.mcap", ODOMETRY, [(i + 5, data) for i, data in messages]))
+    (rows, _), _ = assert_same(log, monkeypatch, sigma="pose.pose.position.x", sigma_m=5.0)
+    assert rows.covariance_m2[:, 0].tolist() == [25.0, 9.0, 25.0, 9.0, 4.0]  # stated, else sigma where it is one, else sigma_m
+
+
+def test_condition_whose_field_no_message_has(tmp_path: Path) -> None:
+    log = open_log(write(tmp_path / "a.mcap", ODOMETRY, [(1, odometry(1.0))]))
+    with pytest.raises(
+        ConfigError, match=r"no message has path 'pose.valid': no field 'valid'; fields there: pose, covariance"
+    ):
+        read(log, where="pose.valid && pose.pose.position.x > 0")
 
 
 def test_path_that_no_message_has_is_named_as_before(tmp_path: Path) -> None:

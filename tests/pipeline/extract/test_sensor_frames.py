@@ -168,6 +168,22 @@ def test_what_no_transform_is_near_is_refused_and_counted(tmp_path: Path) -> Non
     fails(mk(tmp_path / "none"), [seen_row(50.0), *cruise(ros2_row)], InputError, message)
 
 
+@pytest.mark.parametrize("child", ["body_frame_id", "child_frame_id"])
+def test_foxglove_odometry_tells_where_its_body_is(tmp_path: Path, child: str) -> None:
+    def odometry(time_s: float) -> Row:
+        rotation, place = ship(time_s)
+        pose = {
+            "position": dict(zip("xyz", place.tolist(), strict=True)),
+            "orientation": dict(zip("xyzw", rotation.as_quat().tolist(), strict=True)),
+        }
+        message = {"timestamp": stamp(time_s), "frame_id": "odom", child: "ship", "pose": pose}
+        return Row("/own/odom", "foxglove.Odometry", time_s, message)
+
+    found = run(tmp_path, [*(seen_row(i + 0.55, "ship") for i in range(8)), *(odometry(i / 10) for i in range(100))])
+    assert found.frame.frame_id == "odom"
+    np.testing.assert_allclose(found.detections["x_m"], TARGET[0], atol=0.02)
+
+
 def test_odometry_tells_where_its_child_frame_is(tmp_path: Path) -> None:
     def odometry(time_s: float) -> Row:
         rotation, place = ship(time_s)

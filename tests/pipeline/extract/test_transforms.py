@@ -136,7 +136,11 @@ def test_no_transforms() -> None:
         ([-1.0] + [0.0] * 8, None),
         ([1e308, 0.0, 0.0, 1e308], None),  # what drivers write for "do not use"
         ([4.0, 0.0, 0.0, float("inf")], None),
-        ([1e9, 0.0, 0.0, 1e9], (1e9, 0, 1e9, 0, 0, 1e9)),
+        ([1e8, 0.0, 0.0, 1e8], None),
+        ([float("nan")] * 4, None),
+        ([1e7, 0.0, 0.0, 1e7], (1e7, 0, 1e7, 0, 0, 1e7)),
+        ([4.0, 9.0, 16.0], (4, 0, 9, 0, 0, 16)),  # a diagonal
+        ([4.0, 1, 0.5, 0, 0, 0, 9, 0.25, 0, 0, 0, 16, *[0] * 9], (4, 1, 9, 0.5, 0.25, 16)),  # an upper triangle of six
         ([1.0, 2.0], None),
     ],
 )
@@ -144,7 +148,7 @@ def test_stated_covariances(matrix: object, expected: tuple[float, ...] | None) 
     assert stated_covariance(matrix) == expected
 
 
-@pytest.mark.parametrize("matrix", [[1.0, 5.0, 5.0, 1.0], [float("nan")] * 4, [4.0, 0.0, 0.0, 0.0]])
+@pytest.mark.parametrize("matrix", [[1.0, 5.0, 5.0, 1.0], [4.0, 0.0, 0.0, float("nan")], [4.0, 0.0, 0.0, 0.0]])
 def test_what_is_no_covariance(matrix: list[float]) -> None:
     with pytest.raises(ValueError, match="positive definite"):
         stated_covariance(matrix)

@@ -52,7 +52,21 @@ def test_roles() -> None:
         "/map": ("nav_msgs/msg/OccupancyGrid", "obstacles"),
         "/obstacles": ("my.Shapes", "obstacles"),
     }
-    neither = {"/rosout/report": "rcl_interfaces/msg/Log", "/radar/image": "sensor_msgs/msg/Image", "/imu": "sensor_msgs/Imu"}
+    expected |= {
+        "/fmu/out/vehicle_global_position": ("px4_msgs/msg/VehicleGlobalPosition", "poses"),
+        "/fmu/out/transponder_report": ("px4_msgs/msg/TransponderReport", "detections"),
+        "/vicon/fox": ("geometry_msgs/msg/TransformStamped", "truth"),
+        "/fox": ("geometry_msgs/msg/TransformStamped", "tf"),
+        "/rigid_bodies": ("mocap4r2_msgs/msg/RigidBodies", "truth"),
+        "/adsb/aircraft": ("foxglove.GeoJSON", "detections"),
+        "/fence": ("foxglove.GeoJSON", "obstacles"),
+        "/ais": ("", "detections"),
+    }
+    neither: dict[str, str] = {
+        "/goal_pose": POSE, "/setpoint/target": "mavros_msgs/msg/PositionTarget", "/targets/path": "nav_msgs/msg/Path",
+        "/targets/markers": "visualization_msgs/msg/MarkerArray", "/uav/target_pose": POSE, "/chat": "",
+    }  # fmt: skip
+    neither |= {"/rosout/report": "rcl_interfaces/msg/Log", "/radar/image": "sensor_msgs/msg/Image", "/imu": "sensor_msgs/Imu"}
     neither |= {"/scene": SCENE, "/cadence/detection_fix/A": FIX}
     found = suggest(*((topic, schema) for topic, (schema, _) in expected.items()), *neither.items())
     assert found.roles == {topic: role for topic, (_, role) in expected.items()}
@@ -122,6 +136,11 @@ def test_toml_reads_back_as_the_same_sources() -> None:
 
 def test_toml_of_unknown_detections_and_of_dense_logs() -> None:
     assert '# x = "position.x"' in suggest(("/detections", "my.Own")).to_toml()
+    text = f"own_msgs/Fix[] fixes\n{'=' * 80}\nMSG: own_msgs/Fix\nfloat64 lat\nfloat64 lon\n"
+    degrees = FakeChannel("/targets", "own_msgs/msg/Targets", text.encode())
+    assert '# latitude = "fixes[:].lat"\n# longitude = "fixes[:].lon"' in suggest_mapping([degrees]).to_toml()
+    px4 = FakeChannel("/target", "px4_msgs/msg/Own", b"float32 x\nfloat32 y\n")
+    assert '# x = "x"\n# y = "y"\n# frame_convention = "ned"' in suggest_mapping([px4]).to_toml()
     assert "# [extract.thinning]" in suggest(("/cub1/pose", POSE)).to_toml()
     assert suggest(("/imu", "sensor_msgs/Imu")).to_toml() == ""
 
@@ -155,7 +174,8 @@ def test_patterns(pattern: str, topic: str, expected: dict[str, str] | None) -> 
         ({"topic": "/a", "x": "/b.p.x", "y": "p.y"}, "leave the topic out"),
         ({"topic": "/a", "frame_convention": "NED"}, "'NED' is not one of enu, ned"),
         ({"topic": "/a", "x": "p.x", "y": "p[.y"}, r"y: message path 'p\[.y'"),
-        ({"topic": "/a", "preset": "Pose"}, "preset 'Pose' is not known"),
+        ({"topic": "/a", "preset": "Places"}, "preset 'Places' is not known"),
+        ({"topic": "/a", "where": "fix_type => 3"}, "where: condition 'fix_type => 3': expected terms such as"),
         ({"topic": "/a", "sigma_m": 0.0}, "sigma_m"),
     ],
 )

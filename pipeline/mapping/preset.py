@@ -1,0 +1,87 @@
+"""A preset: where messages of one type keep position, time, covariance and identity, and which of them are to be believed."""
+
+from dataclasses import dataclass, replace
+from typing import Final, Literal
+
+Paths = tuple[str, ...]
+"""Alternatives (a type's versions and flattened forms): the first that a message has, and has filled in, is used."""
+
+TIME_PATHS: Paths = ("header.stamp", "timestamp", "stamp")
+FRAME_PATHS: Paths = ("header.frame_id", "frame_id")
+
+PATHS: Final = (
+    "x", "y", "z", "latitude", "longitude", "altitude", "covariance", "covariance_type", "sigma", "time", "frame_id", "agent",
+    "sensor", "score",
+)  # fmt: skip
+"""The fields of a preset that are message paths."""
+
+
+@dataclass(frozen=True)
+class Preset:
+    """Message paths of one type: x and y (metres), or latitude and longitude (degrees); a message may lack all others.
+
+    covariance       of numbers, row-major, x (east) and y (north) first, m²: 1, 4, 9 or 36 of them, 6 or 21 of an upper
+                     triangle, or 3 of a diagonal
+    covariance_type  0 or a word with UNKNOWN: the covariance says nothing
+    sigma            standard deviation of x and y in metres, where there is no covariance
+    where            conditions (see `conditions`); those hold whose fields a message has
+    alternatives     of positions; "first": the first that a message has. "filled": item by item the first that is not zero.
+                     "all": every one of them holds positions of its own
+    json_text        the field whose text is JSON, in which all paths begin
+    frame_convention axes of x, y and z
+    is_north_first   the covariance has y (north) before x (east)
+    role             what such messages hold, whatever their topic is called; None: the topic tells
+    names_agents     messages always have room for the identity of what was seen
+    is_suggested     whether such messages are used without being told
+    """
+
+    schemas: tuple[str, ...]
+    x: Paths = ()
+    y: Paths = ()
+    z: Paths = ()
+    latitude: Paths = ()
+    longitude: Paths = ()
+    altitude: Paths = ()
+    covariance: Paths = ()
+    covariance_type: Paths = ()
+    sigma: Paths = ()
+    where: tuple[str, ...] = ()
+    time: Paths = TIME_PATHS
+    frame_id: Paths = FRAME_PATHS
+    agent: Paths = ()
+    sensor: Paths = ()
+    score: Paths = ()
+    alternatives: Literal["first", "filled", "all"] = "first"
+    json_text: str = ""
+    frame_convention: Literal["enu", "ned"] = "enu"
+    is_north_first: bool = False
+    role: Literal["detections", "truth"] | None = None
+    names_agents: bool = False
+    is_suggested: bool = True
+
+
+def metric(schema: str, *points: str) -> Preset:
+    """Positions in metres at alternative paths of something with x, y and z ("" for the message itself)."""
+    x, y, z = (tuple(f"{point}.{axis}".lstrip(".") for point in points) for axis in "xyz")
+    return Preset((schema,), x, y, z)
+
+
+def geodetic(schema: str, point: str = "") -> Preset:
+    """Positions in degrees with the fields of a fix, in the field `point` of a message ("position.")."""
+    return Preset(
+        (schema,),
+        latitude=(f"{point}latitude",),
+        longitude=(f"{point}longitude",),
+        altitude=(f"{point}altitude",),
+        covariance=(f"{point}position_covariance",),
+        covariance_type=(f"{point}position_covariance_type",),
+    )
+
+
+def stamped_items(preset: Preset, item: str) -> Preset:
+    """The preset where a message without a stamp or a frame of its own has them in its items ("detections[:].")."""
+    return replace(
+        preset,
+        time=(*TIME_PATHS, *(f"{item}{path}" for path in TIME_PATHS)),
+        frame_id=(*FRAME_PATHS, *(f"{item}{path}" for path in FRAME_PATHS)),
+    )

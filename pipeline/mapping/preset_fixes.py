@@ -1,0 +1,135 @@
+"""Presets of positions in latitude and longitude: receivers and autopilots, ships (AIS), aircraft (ADS-B), GeoJSON.
+
+Receivers that state integers have them in 1e-7 degrees and millimetres.
+"""
+
+from dataclasses import replace
+from typing import Final
+
+from pipeline.mapping.preset import FRAME_PATHS, TIME_PATHS, Preset, geodetic
+
+_NOT_SHIPS = (4, 21)
+"""AIS messages of base stations and of aids to navigation."""
+_FEATURES = 'features[:]{geometry.type=="Point"}'
+_POINTS = (f"{_FEATURES}.geometry.coordinates", '{geometry.type=="Point"}.geometry.coordinates')
+
+
+FIXES: Final[dict[str, Preset]] = {
+    "NavSatFix": replace(geodetic("sensor_msgs.NavSatFix"), where=("status.status >= 0",)),
+    "GPSFix": replace(
+        geodetic("gps_msgs.GPSFix"), schemas=("gps_msgs.GPSFix", "gps_common.GPSFix"), where=("status.status >= 0",)
+    ),
+    "LocationFix": geodetic("foxglove.LocationFix"),
+    "LocationFixes": replace(
+        geodetic("foxglove.LocationFixes", "fixes[:]."),
+        time=tuple(f"fixes[:].{path}" for path in TIME_PATHS),
+        frame_id=tuple(f"fixes[:].{path}" for path in FRAME_PATHS),
+    ),
+    "GeoPointStamped": geodetic("geographic_msgs.GeoPointStamped", "position."),
+    "GeoPoseStamped": geodetic("geographic_msgs.GeoPoseStamped", "pose.position."),
+    "GeoPoseWithCovarianceStamped": replace(
+        geodetic("geographic_msgs.GeoPoseWithCovarianceStamped", "pose.pose.position."),
+        covariance=("pose.covariance",),
+        covariance_type=(),
+        is_north_first=True,
+    ),
+    "NavPVT": Preset(
+        ("ublox_msgs.NavPVT", "ublox_msgs.NavPVT7"),
+        latitude=("lat.@div(1e7)",),
+        longitude=("lon.@div(1e7)",),
+        altitude=("h_msl.@div(1000)", "hMSL.@div(1000)", "height.@div(1000)"),
+        sigma=("h_acc.@div(1000)", "hAcc.@div(1000)"),
+        where=("flags & 1", "fix_type != 0", "fix_type != 5", "fixType != 0", "fixType != 5"),
+    ),
+    "GPSRAW": Preset(
+        ("mavros_msgs.GPSRAW",),
+        latitude=("lat.@div(1e7)",),
+        longitude=("lon.@div(1e7)",),
+        altitude=("alt.@div(1000)",),
+        sigma=("h_acc.@div(1000)",),
+        where=("fix_type >= 2",),
+    ),
+    "BESTPOS": Preset(
+        ("novatel_oem7_msgs.BESTPOS",),
+        latitude=("lat",),
+        longitude=("lon",),
+        altitude=("hgt",),
+        sigma=("lat_stdev",),
+        where=("sol_status.status == 0",),
+    ),
+    "SbgGpsPos": replace(
+        geodetic("sbg_driver.SbgGpsPos"), covariance=(), sigma=("position_accuracy.x",), where=("status.status == 0",)
+    ),
+    "VehicleGlobalPosition": Preset(
+        ("px4_msgs.VehicleGlobalPosition", "px4_msgs.VehicleGlobalPositionGroundtruth"),
+        latitude=("lat",),
+        longitude=("lon",),
+        altitude=("alt",),
+        sigma=("eph",),
+        where=("lat_lon_valid",),
+    ),
+    "SensorGps": Preset(
+        ("px4_msgs.SensorGps", "px4_msgs.VehicleGpsPosition"),
+        latitude=("latitude_deg", "lat.@div(1e7)"),
+        longitude=("longitude_deg", "lon.@div(1e7)"),
+        altitude=("altitude_msl_m", "alt.@div(1000)"),
+        sigma=("eph",),
+        where=("fix_type >= 2",),
+        time=("time_utc_usec", *TIME_PATHS),
+    ),
+    "TransponderReport": Preset(
+        ("px4_msgs.TransponderReport",),
+        latitude=("lat",),
+        longitude=("lon",),
+        altitude=("altitude",),
+        where=("flags & 1",),
+        agent=("icao_address",),
+        role="detections",
+        names_agents=True,
+    ),
+    "ADSBVehicle": Preset(
+        ("mavros_msgs.ADSBVehicle",),
+        latitude=("latitude",),
+        longitude=("longitude",),
+        altitude=("altitude",),
+        where=("flags & 1",),
+        agent=("icao_address", "ICAO_address"),
+        role="detections",
+        names_agents=True,
+    ),
+    "AISContact": replace(
+        geodetic("marine_ais_msgs.AISContact", "pose.position."),
+        covariance=("covariance",),
+        covariance_type=(),
+        is_north_first=True,
+        where=tuple(f"position_message_id != {number}" for number in _NOT_SHIPS),
+        agent=("id",),
+        role="detections",
+        names_agents=True,
+    ),
+    # JSON of AIS decoders, which has no schema: gpsd and AIS-catcher (type), pyais (msg_type), aisstream (MetaData).
+    "AIS": Preset(
+        (),
+        latitude=("lat", "latitude", "MetaData.latitude"),
+        longitude=("lon", "longitude", "MetaData.longitude"),
+        where=tuple(f"{name} != {number}" for name in ("type", "msg_type") for number in _NOT_SHIPS),
+        time=("time", "rxuxtime", "MetaData.time_utc"),
+        agent=("mmsi", "MMSI", "MetaData.MMSI"),
+        role="detections",
+        names_agents=True,
+    ),
+    "GeoJSON": Preset(
+        ("foxglove.GeoJSON",),
+        latitude=tuple(f"{point}[1]" for point in _POINTS),
+        longitude=tuple(f"{point}[0]" for point in _POINTS),
+        altitude=tuple(f"{point}[2]" for point in _POINTS),
+        json_text="geojson",
+        agent=tuple(
+            f"{feature}{name}"
+            for feature in ("features[:].", "")
+            for name in ("id", "properties.id", "properties.icao", "properties.mmsi", "properties.name")
+        ),
+        names_agents=True,
+        is_suggested=False,
+    ),
+}
