@@ -230,3 +230,11 @@ def test_info_shows_what_is_left_of_a_damaged_log(tmp_path, capsys):
     (tmp_path / "bad.mcap").write_bytes(b"\x89MCAP0\r\n" + bytes(100))
     assert cli.main(["info", str(tmp_path / "bad.mcap")]) == 0
     assert "DAMAGED" in capsys.readouterr().out
+
+
+def test_a_log_with_the_longest_name_has_results(tmp_path, out, capsys):
+    log = write_log(tmp_path / f"{'n' * 250}.mcap", straight_line())
+    code, err, _ = run(capsys, log, out)
+    assert code == 0, err
+    (directory,) = (path for path in out.iterdir() if path.is_dir())
+    assert {path.suffix for path in directory.iterdir()} >= {".mcap", ".html"}

@@ -3,6 +3,8 @@
 Names alone never join files: `run_0.mcap` and `run_1.mcap` may be two missions.
 """
 
+import hashlib
+import os
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,6 +12,9 @@ from typing import Final
 
 METADATA_NAME: Final = "metadata.yaml"
 _MAX_METADATA_BYTES: Final = 2**24
+_MAX_NAME_BYTES: Final = 200
+"""File systems hold names of 255 bytes; results of a mission append up to 30 to its name."""
+
 _LIST: Final = re.compile(r"^( *)relative_file_paths: *\n((?:\1 *- .*\n?)+)", re.MULTILINE)
 _NUMBERED: Final = re.compile(r"(.+)_\d+")
 
@@ -57,11 +62,21 @@ def named_parts(text: str) -> list[str]:
 
 
 def mission_name(paths: Sequence[Path]) -> str:
-    """What a mission of these parts is called: the stem of the only part, or what the numbered parts have in common."""
+    """What a mission of these parts is called: the stem of the only part, or what the numbered parts have in common.
+
+    A name that is too long to be appended to is cut, with a hash of the whole.
+    """
     stems = [path.stem for path in paths]
     matches = [_NUMBERED.fullmatch(stem) for stem in stems]
     common = {match[1] for match in matches if match}
-    return common.pop() if len(stems) > 1 and None not in matches and len(common) == 1 else stems[0]
+    return _fitting(common.pop() if len(stems) > 1 and None not in matches and len(common) == 1 else stems[0])
+
+
+def _fitting(name: str) -> str:
+    encoded = os.fsencode(name)
+    if len(encoded) <= _MAX_NAME_BYTES:
+        return name
+    return encoded[:_MAX_NAME_BYTES].decode(errors="ignore") + "-" + hashlib.sha256(encoded).hexdigest()[:8]
 
 
 def _order(path: Path) -> int:

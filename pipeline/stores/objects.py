@@ -1,7 +1,6 @@
 """Objects in buckets and on web servers: find, fetch, read, write, list and remove them."""
 
 import contextlib
-import glob
 import hashlib
 import os
 from collections.abc import Callable, Iterator, Mapping
@@ -110,10 +109,11 @@ def fetch(found: StoredObject, folder: Path, progress: Progress) -> Path:
     changes meanwhile, `DeviceError` where the store does not answer or the disk is full.
     """
     identity = hashlib.sha256(f"{shown(found.url)} {found.size_bytes} {found.etag}".encode()).hexdigest()[:16]
-    target, part, mark = (folder / name for name in (found.name, f".{found.name}.{identity}.part", f".{found.name}.{identity}"))
+    hidden = f".{hashlib.sha256(found.name.encode()).hexdigest()[:16]}"  # the name itself may be too long to be appended to
+    target, part, mark = (folder / name for name in (found.name, f"{hidden}.{identity}.part", f"{hidden}.{identity}"))
     if target.is_file() and mark.is_file():
         return target
-    for stale in (*folder.glob(f".{glob.escape(found.name)}.*"), target):
+    for stale in (*folder.glob(f"{hidden}.*"), target):
         if stale != part:
             stale.unlink(missing_ok=True)
     _download(found, part, progress)

@@ -80,3 +80,13 @@ def test_name_of_a_mission(tmp_path):
     assert mission_name([tmp_path / "run_0.mcap", tmp_path / "run_1.mcap"]) == "run"
     assert mission_name([tmp_path / "morning.mcap", tmp_path / "noon.mcap"]) == "morning"
     assert mission_name([tmp_path / "a_0.mcap", tmp_path / "b_1.mcap"]) == "a_0"
+
+
+def test_a_name_that_cannot_be_appended_to_is_cut_and_stays_its_own(tmp_path):
+    long = [tmp_path / f"{'n' * 230}{end}.mcap" for end in "ab"]
+    names = [mission_name([path]) for path in long]
+    assert len(set(names)) == 2 and all(len(name) == 209 and name.startswith("n" * 200 + "-") for name in names)
+    assert mission_name([tmp_path / f"{'n' * 200}.mcap"]) == "n" * 200
+    umlauts = mission_name([tmp_path / f"{'ü' * 115}.mcap"])
+    assert umlauts.startswith("ü" * 100 + "-") and len(umlauts) == 109
+    assert len(mission_name([tmp_path / f"n{'ü' * 115}.mcap"]).encode()) <= 209  # the cut is between letters
