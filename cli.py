@@ -14,6 +14,7 @@ from pipeline.config import stage_config
 from pipeline.manifest import StageResult
 from pipeline.missions import mission_directories
 from pipeline.progress import Progress
+from pipeline.stores.urls import masked
 
 EXIT_INTERRUPTED = 130
 _COMBINED = ["export.combined=true"]
@@ -54,7 +55,7 @@ Engine = Annotated[Literal["local", "ray"], typer.Option(help="Where the work is
 Start = Annotated[str | None, typer.Option(metavar="T", help="Use nothing before T: extract.start.")]
 End = Annotated[str | None, typer.Option(metavar="T", help="Use nothing after T: extract.end.")]
 Topic = Annotated[list[str] | None, typer.Option(metavar="PATTERN", help="Use only such topics: extract.topics; repeatable.")]
-Report = Annotated[Path | None, typer.Option(metavar="FILE", help="Write the outcome of every log as JSON there, too.")]
+Report = Annotated[str | None, typer.Option(metavar="FILE", help="Write the outcome of every log as JSON there, too.")]
 Config = Annotated[
     Path | None, typer.Option("--config", metavar="FILE", help="TOML file with one table a stage (docs/configuration.md).")
 ]
@@ -341,7 +342,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _complain(error: CadenceError | str) -> None:
-    typer.echo(f"cadence: error: {' '.join(str(error).split())}", err=True)
+    typer.echo(f"cadence: error: {masked(' '.join(str(error).split()))}", err=True)
 
 
 def _show(result: StageResult, as_json: bool) -> int:

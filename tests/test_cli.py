@@ -200,3 +200,23 @@ def test_damage_has_its_code_in_every_command_that_reads_the_log(tmp_path, capsy
         assert cli.main(["ingest", str(log), "--out", str(tmp_path / "out"), "-q"]) == code
         assert cli.main(["extract", str(tmp_path / "out" / log.stem), "-q"]) == code
     assert "DAMAGED" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["info", "{url}"], ["doctor", "{url}"], ["ingest", "{url}", "--out", "{out}"], ["extract", "{url}"], ["evaluate", "{url}"],
+        ["run", "{url}", "--out", "{out}"], ["run", "{log}", "--out", "{url}"], ["simulate", "--out", "{url}", "--nope"],
+        ["run", "{log}", "--out", "{out}", "--report", "{url}"],
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("scheme", ["nope", "ftps"])
+def test_secrets_of_urls_are_never_told(arguments, scheme, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    log = write_log(tmp_path / "a.mcap", straight_line(6))
+    url = f"{scheme}://who:p-hidden@host/a.mcap?token=q-hidden"
+    words = [word.format(url=url, out=tmp_path / "out", log=log) for word in arguments]
+    assert cli.main(words) != 0
+    told = "".join(capsys.readouterr())
+    assert "hidden" not in told and "who" not in told and "cadence: error:" in told
+    assert all("hidden" not in path.read_text() for path in tmp_path.rglob("*.json"))

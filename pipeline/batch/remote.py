@@ -29,7 +29,7 @@ from pipeline.progress import Progress
 from pipeline.provenance import versions
 from pipeline.stores.objects import StoredObject, describe, fetch, list_folder, read_bytes, remove, write_file
 from pipeline.stores.stores import MissingObject
-from pipeline.stores.urls import is_url, shown
+from pipeline.stores.urls import is_url, masked, shown
 
 RECEIPT_NAME: Final = "run.manifest.json"
 SOURCE_NAME: Final = ".source"
@@ -50,10 +50,9 @@ def run_anywhere(task: LogTask, progress: Progress) -> LogOutcome:
     except CadenceError as error:
         message, code = str(error), error.exit_code
     except Exception as error:  # as in `run_task`: one log must not cost the results of the others
-        trace, code = _without_secrets(traceback.format_exc(), task), CadenceError.exit_code
-        reason = _without_secrets(str(error), task)
-        message = f"{shown(task.parts[0])}: defect ({type(error).__name__}: {reason}); please report its traceback"
-    return LogOutcome(task, (), " ".join(message.split()), code, time.monotonic() - started_s, trace)
+        trace, code = masked(traceback.format_exc()), CadenceError.exit_code
+        message = f"{task.log}: defect ({type(error).__name__}: {error}); please report its traceback"
+    return LogOutcome(task, (), masked(" ".join(message.split())), code, time.monotonic() - started_s, trace)
 
 
 def write_text(where: str, text: str) -> None:
@@ -266,9 +265,3 @@ def _stage(
 
 def _place(directory: str, name: str) -> Path | str:
     return f"{shown(directory)}/{name}" if is_url(directory) else Path(directory) / name
-
-
-def _without_secrets(text: str, task: LogTask) -> str:
-    for url in (*task.parts, task.directory):
-        text = text.replace(url, shown(url))
-    return text

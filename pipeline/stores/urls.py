@@ -6,6 +6,8 @@ from urllib.parse import unquote, urlsplit
 
 WEB: Final = ("http", "https")
 _URL: Final = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+://")
+_LIKE_URL: Final = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:/")  # a path that was made of one has lost a slash
+_URL_IN_TEXT: Final = re.compile(rf"""({_LIKE_URL.pattern}[^\s'"<>]+?)([:;,.)]*(?=[\s'"<>]|$))""")
 
 
 def is_url(text: str) -> bool:
@@ -15,13 +17,23 @@ def is_url(text: str) -> bool:
 
 def scheme_of(url: str) -> str:
     """What stands before `://`, in lower case."""
-    return url.partition("://")[0].lower()
+    return url.partition(":/")[0].lower()
 
 
 def shown(url: str) -> str:
-    """The URL without what may be secret: a user and its password, and the query of web addresses, which may be a signature."""
-    url = re.sub(r"^([^/]+//)[^/@]*@", r"\1", url)
-    return re.sub(r"[?#].*$", "", url) if scheme_of(url) in WEB else url
+    """The URL without what may be secret: a user and its password, and the query, which may be a signature.
+
+    In the name of an object `?` and `#` are letters, and in a pattern `?` stands for one: there a query has a `=`.
+    """
+    if not _LIKE_URL.match(url):
+        return url
+    url = re.sub(r"^([^/]+:/+)[^/]*@", r"\1", url)
+    return re.sub(r"[?#].*$" if scheme_of(url) in WEB else r"\?[^?]*=.*$", "", url)
+
+
+def masked(text: str) -> str:
+    """A text with every URL in it as it may be shown, also those that a path has made of one (`https:/host`)."""
+    return _URL_IN_TEXT.sub(lambda found: shown(found[1]) + found[2], text)
 
 
 def url_name(url: str) -> str:

@@ -14,7 +14,7 @@ from pipeline.stores import objects as storage
 from pipeline.stores import stores
 from pipeline.stores.objects import describe, fetch, find_objects, list_folder, read_bytes, remove, write_file
 from pipeline.stores.stores import MissingObject
-from pipeline.stores.urls import is_url, shown, url_name
+from pipeline.stores.urls import is_url, masked, shown, url_name
 
 pytest_plugins = ("fixtures.s3",)
 QUIET = Progress(quiet=True)
@@ -38,10 +38,20 @@ def every(name):
         ("https://me:secret@host:8080/x/a.mcap?X-Amz-Signature=secret#top", "https://host:8080/x/a.mcap"),
         ("/a/path?with=signs#and@more", "/a/path?with=signs#and@more"),
         ("s3://bucket/strange?key", "s3://bucket/strange?key"),
+        ("s3://bucket/2026-??/a#1.mcap", "s3://bucket/2026-??/a#1.mcap"),
+        ("gs://me:p@ss@bucket/a.mcap?Signature=secret&Expires=1", "gs://bucket/a.mcap"),
+        ("abfs://container/a.mcap?sv=1&sig=secret", "abfs://container/a.mcap"),
+        ("https:/me:secret@host/a.mcap?sig=secret", "https:/host/a.mcap"),
     ],
 )
 def test_what_may_be_secret_is_not_shown(url, expected):
     assert shown(url) == expected
+
+
+def test_urls_in_a_text_are_masked_and_the_rest_stays():
+    text = "https:/me:secret@host/a?sig=secret: not found; see 'ftp://u:secret@host/b', s3://b/c?X-Amz-Signature=secret."
+    assert masked(text) == "https:/host/a: not found; see 'ftp://host/b', s3://b/c."
+    assert masked("a/b?c=d: 12:30/13:30, me@home; C:/x?y=z") == "a/b?c=d: 12:30/13:30, me@home; C:/x?y=z"
 
 
 def test_names_and_kinds_of_urls():
