@@ -23,6 +23,13 @@ class Progress:
             dynamic_ncols=True, mininterval=0.2,
         )  # fmt: skip
 
+    def percent(self, label: str) -> "tqdm[Any]":
+        """A bar from 0 to 1 for work whose pieces are not alike, so that a rate would say nothing: set `n` and `refresh`."""
+        return tqdm(
+            total=1.0, desc=label, disable=self.quiet, file=sys.stderr, leave=False, dynamic_ncols=True,
+            bar_format="{desc}: {percentage:3.0f}%|{bar}| {elapsed}, {remaining} left{postfix}",
+        )  # fmt: skip
+
     def note(self, text: str) -> None:
         """One line for the person who watches."""
         if not self.quiet:
@@ -37,8 +44,14 @@ class Progress:
         return self
 
 
+class Doing(str):
+    """What a task is at, in a word or two."""
+
+    __slots__ = ()
+
+
 Told = str | float
-"""What a task tells while it runs: a line of text, or the share of it that is done."""
+"""What a task tells while it runs: a line of text, what it is at (`Doing`), or the share of it that is done."""
 
 
 @dataclass(frozen=True)
@@ -51,6 +64,7 @@ class RelayedProgress(Progress):
 
     def bar(self, total: int | None, label: str, unit: str = "it", scale: bool = False) -> "tqdm[Any]":
         """A bar that is not drawn but told."""
+        self.tell(Doing(label))
         return _ToldBar(total, lambda share: self.tell(self.begin + share * (self.end - self.begin)))
 
     def note(self, text: str) -> None:

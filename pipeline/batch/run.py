@@ -27,7 +27,7 @@ from pipeline.catalogue import Catalogue, read_catalogue
 from pipeline.files import hash_file
 from pipeline.manifest import manifest_path
 from pipeline.missions import CATALOGUE_NAME, REPORT_NAME
-from pipeline.progress import Progress, Told
+from pipeline.progress import Doing, Progress, Told
 from pipeline.stores.urls import is_url
 
 _WORKER_BYTES = 2_000_000_000
@@ -38,7 +38,7 @@ EngineName = Literal["local", "ray"]
 
 def run(
     logs: Sequence[str], out: str, config: RunConfig, progress: Progress, force: bool = False,
-    engine: EngineName = "local", num_workers: int | None = None, report: Path | None = None,
+    engine: EngineName = "local", num_workers: int | None = None, report: Path | str | None = None,
     on_unwritten: Callable[[CadenceError], object] | None = None,
 ) -> tuple[LogOutcome, ...]:  # fmt: skip
     """Run all stages on every mission among `logs`, each in its own mission directory under `out`; outcomes in their order.
@@ -131,20 +131,25 @@ def _renamed(tasks: Sequence[LogTask], out: str) -> Iterator[str]:
 
 
 class _Shown:
-    """A batch on stderr: one bar over the bytes of all logs, a line for each that is finished."""
+    """A batch on stderr: one bar over all missions, a line for each that is finished."""
 
     def __init__(self, tasks: Sequence[LogTask], progress: Progress) -> None:
         self._progress, self._num_tasks, self._num_finished = progress, len(tasks), 0
         self._shares = {task.index: 0.0 for task in tasks}
-        self._bar = progress.bar(sum(task.size_bytes for task in tasks), "run", unit="B", scale=True)
+        self._bar = progress.percent("run")
 
     def watch(self, task: LogTask, told: Told) -> None:
-        """A line of text, or how much of the task is done."""
-        if isinstance(told, str):
+        """A line of text, what the task is at, or how much of it is done."""
+        if isinstance(told, Doing):
+            if self._num_tasks == 1:
+                self._bar.set_postfix_str(told)
+        elif isinstance(told, str):
             self._progress.note(told if self._num_tasks == 1 else f"{task.name}: {told}")
         elif told > self._shares[task.index]:
-            self._bar.update((told - self._shares[task.index]) * task.size_bytes)
             self._shares[task.index] = told
+            # Missions count alike: the size of a log says little about the work in it.
+            self._bar.n = min(sum(self._shares.values()) / self._num_tasks, 1.0)
+            self._bar.refresh()
 
     def finished(self, outcome: LogOutcome) -> None:
         """The task is done with."""

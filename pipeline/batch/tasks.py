@@ -4,6 +4,7 @@ Where tasks run is decided by an engine (`pipeline/batch/engines`).
 """
 
 import contextlib
+import itertools
 import time
 import traceback
 from collections.abc import Callable, Generator, Iterator, Sequence
@@ -26,6 +27,8 @@ from pipeline.progress import Progress, Told
 from pipeline.report.stage import report
 
 STAGES = ("ingest", "extract", "infer", "export", "report")
+_PROGRESS = (0.0, 0.05, 0.1, 0.85, 0.95, 1.0)
+"""How much of a mission is done before and after each: most of the time goes into infer."""
 
 
 RunTask = Callable[[LogTask, Progress], LogOutcome]
@@ -59,8 +62,8 @@ def run_task(task: LogTask, progress: Progress) -> LogOutcome:
     try:
         # One thread: results depend on the number of threads, and must not depend on who else is running.
         with _threads(1), locked(Path(task.directory), progress.note):
-            for number, stage in enumerate(_RUNS):
-                finished.append(stage(task, progress.part(number / len(_RUNS), (number + 1) / len(_RUNS))))
+            for stage, (begin, end) in zip(_RUNS, itertools.pairwise(_PROGRESS), strict=True):
+                finished.append(stage(task, progress.part(begin, end)))
     except NothingDetectedError as error:  # of a damaged log nobody knows: detections may be lost
         message, code = _naming(task, str(error)), error.exit_code * is_damaged(finished)
     except CadenceError as error:

@@ -15,12 +15,12 @@ from cadence.errors import InputError
 from pipeline.batch.config import RunConfig
 from pipeline.batch.engines.local import run_in_processes, run_in_sequence
 from pipeline.batch.outcome import LogTask, exit_code
-from pipeline.batch.run import choose_engine, run
+from pipeline.batch.run import _Shown, choose_engine, run
 from pipeline.batch.tasks import run_task, run_tasks
 from pipeline.config import stage_config
 from pipeline.locks import clear_abandoned, locked
 from pipeline.missions import find_missions
-from pipeline.progress import Progress, RelayedProgress
+from pipeline.progress import Doing, Progress, RelayedProgress
 
 pytestmark = pytest.mark.timeout(300)  # on a busy machine the first process takes long to import everything
 QUIET = Progress(quiet=True)
@@ -213,8 +213,21 @@ def test_bars_are_told_as_shares_of_the_task():
             bar.update()
     progress.bar(None, "unknown").update(5)
     progress.note("a line")
-    assert len(told) <= 101 and told[-1] == "a line"
-    assert told[-2] == pytest.approx(0.6, abs=0.005) and told[:-1] == sorted(told[:-1])
+    assert len(told) <= 103 and told[0] == Doing("infer") and told[-2:] == [Doing("unknown"), "a line"]
+    shares = told[1:-2]
+    assert shares[-1] == pytest.approx(0.6, abs=0.005) and shares == sorted(shares)
+
+
+def test_missions_count_alike_in_the_bar_whatever_they_weigh(tmp_path, capsys):
+    tasks = [LogTask(i, (f"{i}.mcap",), f"out/{i}", size, RunConfig()) for i, size in enumerate((1, 10**12, 7))]
+    shown = _Shown(tasks, Progress())
+    for task in tasks:
+        for share in [0.1 * step for step in range(1, 11)]:
+            shown.watch(task, share)
+        shown.watch(task, Doing("infer"))
+        bar = capsys.readouterr().err.split("\r")[-1]
+        assert f"{round(100 * (task.index + 1) / 3)}%|" in bar and "B/s" not in bar and "infer" not in bar
+    shown.close()
 
 
 def test_a_defect_comes_back_with_its_traceback(tmp_path, monkeypatch):
