@@ -12,6 +12,7 @@ from typing import Any, Final
 
 from cadence.errors import ConfigError, InputError
 from pipeline.config import read_config
+from pipeline.documents import parse_json
 from pipeline.files import hash_file
 from pipeline.logs.parts import mission_name
 from pipeline.logs.reader import Health, MissionLog, reopen
@@ -90,7 +91,7 @@ def read_catalogue(directory: Path) -> Catalogue:
     """The catalogue in `directory`; `InputError` where it is absent, damaged or of another version."""
     path = directory / CATALOGUE_NAME
     try:
-        data = json.loads(path.read_text(encoding="utf-8"))
+        data = parse_json(path.read_text(encoding="utf-8"))
     except FileNotFoundError as error:
         raise InputError(f"{path}: not found; run `cadence ingest` first (`cadence run` does all stages)") from error
     except (OSError, ValueError) as error:

@@ -15,6 +15,7 @@ from torch import Tensor, nn
 import cadence
 from cadence.errors import ConfigError, DeviceError
 from pipeline.config import config_as_dict, read_config
+from pipeline.documents import parse_json
 from pipeline.files import hash_file, replacing, write_atomic
 
 FORMAT = 1
@@ -79,7 +80,7 @@ def read_info(path: Path) -> CheckpointInfo:
     """The JSON beside the weights at `path`."""
     beside = path.with_suffix(".json")
     try:
-        content = json.loads(beside.read_text(encoding="utf-8"))
+        content = parse_json(beside.read_text(encoding="utf-8"))
     except OSError as error:
         raise ConfigError(
             f"{beside}: cannot read the checkpoint's description ({error.strerror}); it belongs beside them"

@@ -5,7 +5,7 @@ An unknown key is an error that names the known ones; a value of the wrong type 
 
 import dataclasses
 import math
-import tomllib
+import reprlib
 import types
 import typing
 from collections.abc import Mapping, Sequence
@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from cadence.errors import ConfigError
+from pipeline.documents import parse_toml
 
 T = TypeVar("T")
 
@@ -23,10 +24,10 @@ TABLES = ("ingest", "extract", "infer", "export", "report", "evaluate", "simulat
 def load_toml(path: Path) -> dict[str, Any]:
     """The tables of a TOML file; `ConfigError` names file, line and column."""
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        return parse_toml(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise ConfigError(f"{path}: cannot read the configuration ({error.strerror}); check the path") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except ValueError as error:
         raise ConfigError(f"{path}: not valid TOML: {error}; correct the file") from error
 
 
@@ -80,8 +81,8 @@ def parse_override(text: str) -> tuple[tuple[str, ...], Any]:
     if not separator or not key.strip():
         raise ConfigError(f"--set {text!r}: expected KEY=VALUE, for example --set infer.num_hypotheses=50")
     try:
-        parsed = tomllib.loads(f"value = {value}")["value"]
-    except tomllib.TOMLDecodeError:
+        parsed = parse_toml(f"value = {value}")["value"]
+    except ValueError:
         parsed = value
     if not isinstance(parsed, str | int | float | list | dict):  # a bare date or time of day: no key wants one
         parsed = value
@@ -162,11 +163,11 @@ def _convert(hint: Any, value: Any, where: str) -> Any:
     if origin is typing.Literal:
         if value in arguments:
             return value
-        raise ConfigError(f"{where}: {value!r} is not one of {', '.join(map(str, arguments))}")
+        raise ConfigError(f"{where}: {_brief(value)} is not one of {', '.join(map(str, arguments))}")
     if dataclasses.is_dataclass(hint):
         if isinstance(value, Mapping):
             return read_config(typing.cast(type[Any], hint), value, where)
-        raise ConfigError(f"{where}: expected a table, got {value!r}")
+        raise ConfigError(f"{where}: expected a table, got {_brief(value)}")
     if origin is tuple and isinstance(value, list | tuple):
         if len(arguments) == 2 and arguments[1] is Ellipsis:
             return tuple(_convert(arguments[0], item, f"{where}[{i}]") for i, item in enumerate(value))
@@ -183,7 +184,7 @@ def _convert(hint: Any, value: Any, where: str) -> Any:
     is_number = not (isinstance(value, float) and math.isnan(value))  # TOML has nan; no key means anything by it
     if isinstance(hint, type) and isinstance(value, hint) and (hint is bool or not isinstance(value, bool)) and is_number:
         return value
-    raise ConfigError(f"{where}: expected {_describe(hint)}, got {value!r}")
+    raise ConfigError(f"{where}: expected {_describe(hint)}, got {_brief(value)}")
 
 
 def _convert_union(arguments: tuple[Any, ...], value: Any, where: str) -> Any:
@@ -196,7 +197,12 @@ def _convert_union(arguments: tuple[Any, ...], value: Any, where: str) -> Any:
                 return _convert(argument, value, where)
             except ConfigError as error:
                 errors.append(error)
-    raise errors[0] if len(errors) == 1 else ConfigError(f"{where}: got {value!r}, which fits none of the allowed types")
+    raise errors[0] if len(errors) == 1 else ConfigError(f"{where}: got {_brief(value)}, which fits none of the allowed types")
+
+
+def _brief(value: Any) -> str:
+    """The value as in a message of one line: long ones are cut."""
+    return reprlib.repr(value)
 
 
 def _describe(hint: Any) -> str:

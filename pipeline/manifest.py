@@ -14,6 +14,7 @@ from typing import Any, Final, Literal
 
 from cadence.errors import InputError
 from pipeline.config import config_as_dict
+from pipeline.documents import parse_json
 from pipeline.files import hash_file, working_folder, write_atomic
 from pipeline.locks import clear_abandoned
 from pipeline.provenance import versions
@@ -42,7 +43,7 @@ def manifest_path(stage: str, directory: Path) -> Path:
 def read_manifest(stage: str, directory: Path) -> dict[str, Any] | None:
     """The manifest of an earlier run of `stage`; None where there is none, or none that can be read."""
     try:
-        manifest = json.loads(manifest_path(stage, directory).read_text(encoding="utf-8"))
+        manifest = parse_json(manifest_path(stage, directory).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return None
     return manifest if isinstance(manifest, dict) else None

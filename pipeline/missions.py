@@ -3,7 +3,6 @@
 import glob
 import hashlib
 import itertools
-import json
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -11,6 +10,7 @@ from pathlib import Path
 from typing import Final
 
 from cadence.errors import CadenceError, InputError, UsageError
+from pipeline.documents import parse_json
 from pipeline.logs.parts import METADATA_NAME, group_parts, mission_name, named_parts
 from pipeline.stores.objects import StoredObject, find_objects, read_bytes
 from pipeline.stores.urls import is_url, shown, url_name
@@ -180,7 +180,7 @@ def _directories(groups: Sequence[tuple[str, ...]], out: str) -> list[str]:
 def _ingested_log(directory: Path) -> Path | None:
     """The log whose results a mission directory holds; None where it holds none, or the log was fetched for it."""
     try:
-        path = Path(json.loads((directory / CATALOGUE_NAME).read_text(encoding="utf-8"))["path"])
+        path = Path(parse_json((directory / CATALOGUE_NAME).read_text(encoding="utf-8"))["path"])
     except (OSError, ValueError, KeyError, TypeError):
         return None
     return path if path.is_absolute() else None

@@ -15,6 +15,7 @@ import torch
 from cadence.constraints.obstacles import Obstacles
 from cadence.errors import InputError
 from cadence.worlds.terrain import Terrain
+from pipeline.documents import parse_json
 
 VERSION = 1
 OBSTACLES_NAME = "obstacles.json"
@@ -35,7 +36,7 @@ def read_obstacles(path: Path) -> Obstacles:
 def read_obstacle_entries(path: Path) -> list[Json]:
     """The entries of an obstacles.json, each with its meaning checked; `InputError` where the file is absent or not ours."""
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = parse_json(path.read_text(encoding="utf-8"))
         return [checked_entry(entry) for entry in listed_entries(content)]
     except OSError as error:
         raise InputError(

@@ -9,6 +9,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from cadence.errors import InputError
+from pipeline.documents import parse_json
 from schemas.tables import VERSION
 
 
@@ -42,7 +43,7 @@ def read_table(path: Path, name: str) -> tuple[pa.Table, Frame]:
         metadata: dict[bytes, Any] = table.schema.metadata or {}
         kind = metadata.get(b"cadence.table", b"").decode()
         version = metadata.get(b"cadence.version", b"").decode()
-        frame = Frame(**json.loads(metadata.get(b"cadence.frame", b"{}")))
+        frame = Frame(**parse_json(metadata.get(b"cadence.frame", b"{}")))
     except (pa.ArrowException, OSError, ValueError, TypeError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise InputError(f"{path}: not a readable cadence table ({reason}); run its stage again with --force") from error

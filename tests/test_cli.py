@@ -205,8 +205,8 @@ def test_damage_has_its_code_in_every_command_that_reads_the_log(tmp_path, capsy
 @pytest.mark.parametrize(
     "arguments",
     [
-        ["info", "{url}"], ["doctor", "{url}"], ["ingest", "{url}", "--out", "{out}"], ["extract", "{url}"], ["evaluate", "{url}"],
-        ["run", "{url}", "--out", "{out}"], ["run", "{log}", "--out", "{url}"], ["simulate", "--out", "{url}", "--nope"],
+        ["info", "{url}"], ["doctor", "{url}"], ["ingest", "{url}", "--out", "{out}"], ["extract", "{url}"],
+        ["evaluate", "{url}"], ["run", "{url}", "--out", "{out}"], ["run", "{log}", "--out", "{url}"], ["simulate", "--out", "{url}", "--nope"],
         ["run", "{log}", "--out", "{out}", "--report", "{url}"],
     ],
 )  # fmt: skip

@@ -22,6 +22,7 @@ from cadence.errors import CadenceError, DeviceError
 from pipeline.batch.outcome import LogOutcome, LogTask
 from pipeline.batch.tasks import run_task
 from pipeline.config import config_as_dict
+from pipeline.documents import parse_json
 from pipeline.files import hash_file, write_atomic
 from pipeline.locks import locked
 from pipeline.manifest import StageResult, manifest_path, read_manifest
@@ -195,7 +196,7 @@ def _read_receipt(directory: str) -> dict[str, Any] | None:
     """The receipt of an earlier run; None where there is none, or none that can be read."""
     try:
         text = read_bytes(f"{directory}/{RECEIPT_NAME}") if is_url(directory) else (Path(directory) / RECEIPT_NAME).read_bytes()
-        receipt = json.loads(text)
+        receipt = parse_json(text)
     except (MissingObject, OSError, ValueError):
         return None
     is_whole = isinstance(receipt, dict) and isinstance(receipt.get("files"), dict) and isinstance(receipt.get("stages"), list)

@@ -14,6 +14,7 @@ import pyarrow.compute as pc
 from cadence.errors import InputError
 from cadence.recordings import Recordings
 from pipeline.arrays import Float64s, Int64s
+from pipeline.documents import parse_json
 from pipeline.extract.stage import ExtractConfig, write_tables
 from pipeline.logs.reader import MissionLog, open_log
 from pipeline.mapping.guess import suggest_mapping
@@ -74,7 +75,7 @@ def read_log_episodes(path: Path, extract: ExtractConfig, gridding: Gridding) ->
     with tempfile.TemporaryDirectory() as folder:
         write_tables(log, Path(folder), extract, Progress(quiet=True))
         tables = {name: _table(Path(folder), name) for name in ("detections", "truth", "poses")}
-        entries = json.loads((Path(folder) / OBSTACLES_NAME).read_text(encoding="utf-8"))["obstacles"]
+        entries = parse_json((Path(folder) / OBSTACLES_NAME).read_text(encoding="utf-8"))["obstacles"]
     truth, seen = tables["truth"], tables["detections"]
     if truth is None:
         raise InputError(f"{path}: has no truth to score against; name its topic with [[evaluate.forecast.extract.truth]]")
@@ -117,7 +118,7 @@ def _table(folder: Path, name: str) -> pa.Table | None:
 def _number(record: Mapping[str, str], key: str) -> float | None:
     """A number out of a Metadata record; None where there is none."""
     try:
-        value = float(json.loads(record[key]))
+        value = float(parse_json(record[key]))
     except (KeyError, ValueError, TypeError):
         return None
     return value if np.isfinite(value) else None
@@ -206,7 +207,7 @@ def _known_goal(mission: Mapping[str, str]) -> Float64s:
     """The goal [2] that the searching side knows, the first where there are several; NaN where none is stated."""
     for key in GOAL_KEYS:
         try:
-            value = np.asarray(json.loads(mission[key]), dtype=np.float64).reshape(-1, 2)
+            value = np.asarray(parse_json(mission[key]), dtype=np.float64).reshape(-1, 2)
         except (KeyError, ValueError, TypeError):
             continue
         if len(value):

@@ -4,7 +4,6 @@ obstacles.json holds {"version": 1, "obstacles": [...]}; an obstacle is {"kind":
 {"kind": "polygon", "rings_m": [exterior, holes...]}, each with an optional "name", in the mission frame.
 """
 
-import json
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -15,6 +14,7 @@ import numpy as np
 
 from cadence.errors import ConfigError
 from pipeline.config import load_toml, read_config
+from pipeline.documents import parse_json
 from pipeline.extract.grids import (
     FOXGLOVE_GRIDS,
     ROS_GRIDS,
@@ -148,7 +148,7 @@ def _from_file(path: Path, frame: Frame) -> list[Json]:
         tables = read_config(_ObstacleFile, load_toml(path), str(path))
         return list(_from_tables(tables.circles, tables.polygons, frame, str(path)))
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = parse_json(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise ConfigError(f"{path}: cannot read the obstacles ({error.strerror}); check the path") from error
     except ValueError as error:
@@ -203,7 +203,7 @@ def _from_metadata(log: MissionLog, frame: Frame, note: Note) -> list[Json]:
                 found += _from_record(record, frame, where)
             elif name == "mission" and "mountains" in record:
                 _check_local(frame, where)
-                mountains = json.loads(record["mountains"])
+                mountains = parse_json(record["mountains"])
                 found += [
                     checked_entry({"kind": "circle", **item, "radius_m": item["keep_out_radius_m"]}) for item in mountains
                 ]
@@ -222,12 +222,12 @@ def _from_record(record: Mapping[str, str], frame: Frame, where: str) -> list[Js
     """A record `cadence.obstacles`: `geojson`, or `obstacles` (entries of obstacles.json) in metres about its datum."""
     found: list[Json] = []
     if "geojson" in record:
-        found += _from_geojson(json.loads(record["geojson"]), frame, where)
-    content = json.loads(record.get("obstacles", "[]"))
+        found += _from_geojson(parse_json(record["geojson"]), frame, where)
+    content = parse_json(record.get("obstacles", "[]"))
     entries = [checked_entry(entry) for entry in (content if isinstance(content, list) else listed_entries(content))]
     if "latitude_deg" in record and "longitude_deg" in record:
         if frame.is_georeferenced:
-            datum = Frame("record", float(json.loads(record["latitude_deg"])), float(json.loads(record["longitude_deg"])))
+            datum = Frame("record", float(parse_json(record["latitude_deg"])), float(parse_json(record["longitude_deg"])))
             entries = [_moved(entry, datum, frame) for entry in entries]
     elif entries:
         _check_local(frame, where)

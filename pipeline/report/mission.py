@@ -4,7 +4,6 @@ Letters of the shapes: K hypothesis, A agent, T time step, N point. Positions ar
 unless a name says otherwise.
 """
 
-import json
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -16,6 +15,7 @@ import pyarrow as pa
 
 from cadence.errors import InputError
 from pipeline.arrays import Float32s, Float64s, Int64s
+from pipeline.documents import parse_json
 from pipeline.files import hash_file
 from pipeline.manifest import read_manifest
 from pipeline.obstacle_file import OBSTACLES_NAME, read_obstacle_entries
@@ -214,7 +214,7 @@ def _is_stale(manifest: JsonDict | None, path: Path) -> bool:
 
 def _read_json(path: Path) -> JsonDict:
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = parse_json(path.read_text(encoding="utf-8"))
     except FileNotFoundError as error:
         raise InputError(f"{path}: not found; run the stage that writes it first (cadence run does all of them)") from error
     except (OSError, ValueError) as error:

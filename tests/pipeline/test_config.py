@@ -133,3 +133,13 @@ def test_toml_errors_name_file_and_line(tmp_path):
 def test_config_as_dict_reads_back_to_the_same_config():
     config = Outer("n", path=Path("p"), rows=(Inner("b"),), table={"k": 2})
     assert read_config(Outer, config_as_dict(config)) == config
+
+
+def test_nesting_without_end_is_one_short_line(tmp_path):
+    path = tmp_path / "deep.toml"
+    path.write_text("a = " + "[" * 20_000 + "]" * 20_000)
+    with pytest.raises(ConfigError, match=r"deep\.toml: not valid TOML: nested too deeply; correct the file"):
+        load_tables(path)
+    with pytest.raises(ConfigError) as caught:
+        read_config(Outer, {"name": "n", "count": parse_override("count=" + "[" * 20_000)[1]})
+    assert len(str(caught.value)) < 200
