@@ -8,11 +8,12 @@ from typing import Annotated, Literal
 
 import typer
 
-from cadence.errors import CadenceError, PartialInputError, UsageError
+from cadence.errors import CadenceError, DeviceError, PartialInputError, UsageError
 from pipeline.batch.summaries import batch_summary, log_record, stage_exit_code, stage_summary, to_json
 from pipeline.config import stage_config
 from pipeline.manifest import StageResult
 from pipeline.missions import mission_directories
+from pipeline.out_of_memory import ADVICE, is_out_of_memory
 from pipeline.progress import Progress
 from pipeline.stores.urls import masked
 
@@ -332,6 +333,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except typer.TyperException as error:
         _complain(UsageError(f"{error.format_message()} (see cadence --help)"))
         return UsageError.exit_code
+    except (MemoryError, RuntimeError) as error:
+        if not is_out_of_memory(error):
+            raise
+        _complain(ADVICE)
+        return DeviceError.exit_code
     except BrokenPipeError:
         # The reader (head, less) has what it wanted; what Python would still flush at exit goes nowhere.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

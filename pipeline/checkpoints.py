@@ -3,14 +3,17 @@
 import dataclasses
 import functools
 import json
-from collections.abc import Mapping
+import math
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
+import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
+from torch.overrides import TorchFunctionMode
 
 import cadence
 from cadence.errors import ConfigError, DeviceError
@@ -18,9 +21,17 @@ from pipeline.config import config_as_dict, read_config
 from pipeline.documents import parse_json
 from pipeline.files import hash_file, replacing, write_atomic
 
+Network = TypeVar("Network", bound=nn.Module)
+
 FORMAT = 1
 WEIGHTS_NAME = "checkpoint.safetensors"
 """What a training calls its weights, in a folder of its own."""
+
+_MAX_SIZE = 2**14
+"""No network has more of anything; layers without end would be built for ever."""
+_SPARE_NUMBERS = 1_000_000
+"""For what a network makes beside its weights."""
+_CREATORS = (torch.empty, torch.zeros, torch.ones, torch.full, torch.rand, torch.randn)
 
 DEFAULT = "general"
 """Name of the shipped checkpoint that is used unless another is asked for."""
@@ -107,6 +118,38 @@ def _tensors(path: Path, size_bytes: int, modified_ns: int) -> dict[str, Tensor]
     return tensors
 
 
+def load_network(path: Path, build: Callable[[], Network]) -> Network:
+    """The network that `build` makes with the weights at `path`, ready to be evaluated; `ConfigError` where they do not fit."""
+    try:
+        with _Ration(path):
+            network = build()
+    except (ArithmeticError, AssertionError, LookupError, RuntimeError, ValueError) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise ConfigError(f"{path.with_suffix('.json')}: describes no network ({reason}); take the checkpoint again") from error
+    load_weights(path, network)
+    return network.eval()
+
+
+class _Ration(TorchFunctionMode):
+    """Refuses to make tensors that hold more numbers, together, than a checkpoint has bytes: its JSON may state any size."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__()
+        self._path, self._left = path, _SPARE_NUMBERS + (path.stat().st_size if path.is_file() else 0)
+
+    def __torch_function__(
+        self, func: Callable[..., Any], types: Any, args: tuple[Any, ...] = (), kwargs: Mapping[str, Any] | None = None
+    ) -> Any:
+        if func in _CREATORS and args:
+            self._left -= math.prod(args[0] if isinstance(args[0], tuple | list) else args)
+            if self._left < 0:
+                beside = self._path.with_suffix(".json")
+                raise ConfigError(
+                    f"{beside}: describes a larger network than its weights are of; take both files of one training"
+                )
+        return func(*args, **(kwargs or {}))
+
+
 def load_weights(path: Path, network: nn.Module) -> None:
     """Put the weights at `path` into `network`; `ConfigError` names the first tensor that does not fit."""
     try:
@@ -143,4 +186,14 @@ def network_config(cls: type[Any], info: CheckpointInfo, where: Path) -> Any:
     """The network's configuration as an instance of `cls`."""
     if not dataclasses.is_dataclass(cls):
         raise TypeError(f"{cls} is not a dataclass")
-    return read_config(cls, info.network, f"{where.with_suffix('.json')}: network")
+    beside = where.with_suffix(".json")
+    if _largest(info.network) > _MAX_SIZE:
+        raise ConfigError(f"{beside}: network: states a size of {_largest(info.network):g}; take the checkpoint again")
+    return read_config(cls, info.network, f"{beside}: network")
+
+
+def _largest(value: Any) -> int:
+    """The largest whole number anywhere in a JSON value; 0 where there is none."""
+    if isinstance(value, Mapping | list):
+        return max(map(_largest, value.values() if isinstance(value, Mapping) else value), default=0)
+    return value if isinstance(value, int) else 0

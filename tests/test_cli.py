@@ -157,6 +157,23 @@ def test_defect_keeps_its_traceback(fake_infer):
         cli.main(["infer", "m"])
 
 
+@pytest.mark.parametrize("library", ["torch", "numpy", "pyarrow"])
+def test_memory_that_is_refused_is_one_line_and_code_5(library, fake_infer, capsys):
+    import numpy
+    import pyarrow
+    import torch
+
+    ask = {
+        "torch": lambda: torch.empty(10**15),
+        "numpy": lambda: numpy.empty(10**15),
+        "pyarrow": lambda: pyarrow.allocate_buffer(2**60),
+    }
+    fake_infer(ask[library])
+    assert cli.main(["infer", "m"]) == 5
+    captured = capsys.readouterr()
+    assert captured.out == "" and captured.err.startswith("cadence: error: out of memory; ") and captured.err.count("\n") == 1
+
+
 def test_unknown_key_names_the_known_ones(capsys):
     assert cli.main(["infer", "m", "--set", "infer.nope=1"]) == 4
     error = capsys.readouterr().err
@@ -206,7 +223,8 @@ def test_damage_has_its_code_in_every_command_that_reads_the_log(tmp_path, capsy
     "arguments",
     [
         ["info", "{url}"], ["doctor", "{url}"], ["ingest", "{url}", "--out", "{out}"], ["extract", "{url}"],
-        ["evaluate", "{url}"], ["run", "{url}", "--out", "{out}"], ["run", "{log}", "--out", "{url}"], ["simulate", "--out", "{url}", "--nope"],
+        ["evaluate", "{url}"], ["run", "{url}", "--out", "{out}"], ["run", "{log}", "--out", "{url}"],
+        ["simulate", "--out", "{url}", "--nope"],
         ["run", "{log}", "--out", "{out}", "--report", "{url}"],
     ],
 )  # fmt: skip

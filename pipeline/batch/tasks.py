@@ -23,6 +23,7 @@ from pipeline.ingest.stage import ingest
 from pipeline.locks import locked
 from pipeline.manifest import StageResult
 from pipeline.missions import find_missions
+from pipeline.out_of_memory import ADVICE, is_out_of_memory
 from pipeline.progress import Progress, Told
 from pipeline.report.stage import report
 
@@ -68,13 +69,14 @@ def run_task(task: LogTask, progress: Progress) -> LogOutcome:
         message, code = _naming(task, str(error)), error.exit_code * is_damaged(finished)
     except CadenceError as error:
         message, code = _naming(task, str(error)), error.exit_code
-    except MemoryError:
-        message, code = f"{task.log}: out of memory; use fewer --workers", DeviceError.exit_code
     except Exception as error:  # a defect met by one log of a long batch must not cost the results of the others
-        trace = traceback.format_exc()
-        stage_name = STAGES[min(len(finished), len(STAGES) - 1)]
-        message = f"{task.log}: defect in {stage_name} ({type(error).__name__}: {error}); please report its traceback"
-        code = CadenceError.exit_code
+        if is_out_of_memory(error):
+            message, code = f"{task.log}: {ADVICE}", DeviceError.exit_code
+        else:
+            trace = traceback.format_exc()
+            stage_name = STAGES[min(len(finished), len(STAGES) - 1)]
+            message = f"{task.log}: defect in {stage_name} ({type(error).__name__}: {error}); please report its traceback"
+            code = CadenceError.exit_code
     return LogOutcome(task, tuple(finished), " ".join(message.split()), code, time.monotonic() - started_s, trace)
 
 

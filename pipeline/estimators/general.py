@@ -12,7 +12,7 @@ from cadence.diffusion.gate import gated
 from cadence.diffusion.general import GeneralModel
 from cadence.errors import ConfigError, DeviceError
 from cadence.network.residual import ResidualNetwork, ResidualNetworkConfig
-from pipeline.checkpoints import expect_preset, load_weights, network_config
+from pipeline.checkpoints import expect_preset, load_network, network_config
 from pipeline.estimators.fitting import FittingData
 from pipeline.estimators.loaded import Fitted, Loaded
 from pipeline.estimators.samplings import Samplings
@@ -25,9 +25,8 @@ def load_general(weights: Path | None, samplings: Samplings) -> Loaded:
     network = None
     if weights is not None:
         info = expect_preset(weights, "general")
-        network = ResidualNetwork(network_config(ResidualNetworkConfig, info, weights))
-        load_weights(weights, network)
-        network.eval().to(device)
+        config: ResidualNetworkConfig = network_config(ResidualNetworkConfig, info, weights)
+        network = load_network(weights, lambda: ResidualNetwork(config)).to(device)
     sampling = samplings.general
     model = GeneralModel(Bank(), network, sampling.sampler, sampling.num_steps, device=device)
     return Loaded(

@@ -7,7 +7,7 @@ from typing import Literal
 from cadence.baselines.grammi import GrammiNetwork, GrammiNetworkConfig
 from cadence.baselines.mixture import MixtureFrame, MixtureModel
 from cadence.baselines.vrnn import VrnnNetwork, VrnnNetworkConfig
-from pipeline.checkpoints import CheckpointInfo, expect_preset, load_weights, network_config
+from pipeline.checkpoints import CheckpointInfo, expect_preset, load_network, network_config
 from pipeline.estimators.loaded import Loaded
 from pipeline.estimators.samplings import Samplings
 from pipeline.windows import GridConfig
@@ -44,9 +44,8 @@ def load_rival(weights: Path, uses_goal: bool = False) -> MixtureModel:
     """The estimator of a rival's checkpoint; `ConfigError` where it is of another preset or does not fit."""
     info = expect_preset(weights, *RIVALS)
     config = rival_config(info, weights)
-    network = fresh_rival(config)
-    load_weights(weights, network)
-    return MixtureModel(network.eval(), config.frame, info.preset, uses_goal)
+    network = load_network(weights, lambda: fresh_rival(config))
+    return MixtureModel(network, config.frame, info.preset, uses_goal)
 
 
 def rival_config(info: CheckpointInfo, weights: Path) -> VrnnConfig | GrammiConfig:

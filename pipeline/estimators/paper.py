@@ -4,7 +4,7 @@ from pathlib import Path
 
 from cadence.diffusion.absolute import AbsoluteConfig, AbsoluteModel, AbsoluteSampling
 from cadence.network.trajectory import TrajectoryNetwork
-from pipeline.checkpoints import expect_preset, load_weights, network_config
+from pipeline.checkpoints import expect_preset, load_network, network_config
 from pipeline.estimators.loaded import Loaded
 from pipeline.estimators.samplings import Samplings
 from pipeline.windows import GridConfig
@@ -20,9 +20,8 @@ def load_absolute(weights: Path, sampling: AbsoluteSampling | None = None) -> Ab
     """The estimator of a checkpoint; `ConfigError` where it is of another preset or does not fit."""
     info = expect_preset(weights, "paper")
     config: AbsoluteConfig = network_config(AbsoluteConfig, info, weights)
-    network = TrajectoryNetwork(config.network)
-    load_weights(weights, network)
-    return AbsoluteModel(network.eval(), config, sampling or AbsoluteSampling())
+    network = load_network(weights, lambda: TrajectoryNetwork(config.network))
+    return AbsoluteModel(network, config, sampling or AbsoluteSampling())
 
 
 def absolute_grid(config: AbsoluteConfig, stride_steps: int = 16) -> GridConfig:

@@ -8,7 +8,7 @@ from cadence.diffusion.scene import SceneModel, SceneSampling
 from cadence.diffusion.scene_frame import SceneConfig
 from cadence.errors import ConfigError
 from cadence.recordings import NUM_STEPS
-from pipeline.checkpoints import expect_preset, load_weights, network_config
+from pipeline.checkpoints import expect_preset, load_network, network_config
 from pipeline.estimators.loaded import Loaded
 from pipeline.estimators.samplings import Samplings
 from pipeline.windows import GridConfig
@@ -27,9 +27,7 @@ def load_scene(weights: Path, sampling: SceneSampling | None = None) -> SceneMod
     """The estimator of a checkpoint; `ConfigError` where it is of another preset or does not fit."""
     info = expect_preset(weights, "scene")
     config: SceneConfig = network_config(SceneConfig, info, weights)
-    network = config.build()
-    load_weights(weights, network)
-    return SceneModel(network.eval(), config, sampling or SceneSampling())
+    return SceneModel(load_network(weights, config.build), config, sampling or SceneSampling())
 
 
 def scene_grid(config: SceneConfig, stride_steps: int = 16) -> GridConfig:

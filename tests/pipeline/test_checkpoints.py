@@ -122,6 +122,25 @@ def test_weights_of_another_shape_or_network(saved: Path) -> None:
     assert "level.layers.0.bias, which the network has not" in str(one_line(load_weights, saved, less))
 
 
+@pytest.mark.parametrize(
+    "sizes",
+    [
+        {"width": 8 * 10**12},
+        {"width": 16_000},
+        {"width": 8, "multipliers": [1, 16_000]},
+        {"width": 8, "num_blocks": 10**9},
+        {"encoder_size": 16_000},
+        {"width": -8},
+        {"multipliers": []},
+    ],
+    ids=str,
+)
+def test_sizes_that_the_weights_do_not_have_are_refused_before_memory_is_asked_for(saved: Path, sizes: dict) -> None:
+    edit(saved, network=config_as_dict(SMALL) | sizes)
+    error = one_line(load_general, saved, Samplings(device="cpu"))
+    assert isinstance(error, ConfigError) and "net." in str(error)
+
+
 def test_weights_that_are_damaged(saved: Path) -> None:
     whole = saved.read_bytes()
     for damaged in (b"", whole[:50], whole[:-10], b"\xff" * 200):

@@ -83,8 +83,12 @@ def test_a_defect_shows_its_traceback_and_does_not_stop_the_others(calls, tmp_pa
 
 
 def test_memory_that_ran_out_is_no_defect(calls, tmp_path):
-    calls.failing = {("infer", "a"): MemoryError()}
-    assert [(outcome.exit_code, "fewer --workers" in outcome.message) for outcome in run_here("a", tmp_path)] == [(5, True)]
+    for refused in (MemoryError(), RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried to allocate 9 bytes")):
+        calls.failing = {("infer", "a"): refused}
+        outcomes = run_here("a", tmp_path)
+        assert [(outcome.exit_code, "fewer --workers" in outcome.message, outcome.trace) for outcome in outcomes] == [
+            (5, True, "")
+        ]
 
 
 def test_interruption_is_not_a_failure_of_a_log(calls, tmp_path):

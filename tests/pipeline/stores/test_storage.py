@@ -212,7 +212,7 @@ def test_a_full_disk_is_not_the_stores_fault(s3, tmp_path):
     put(tmp_path, "s3://sea/a.mcap")
     found = describe("s3://sea/a.mcap")
     fetch(found, tmp_path, QUIET)
-    (mark,) = tmp_path.glob(".a.mcap.*")
+    (mark,) = tmp_path.glob(".*")
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / f"{mark.name}.part").symlink_to("/dev/full")
     s3.requests.clear()
