@@ -1,9 +1,7 @@
 """Batches: which logs are meant, workers that die, results that do not depend on how many work."""
 
 import functools
-import multiprocessing.forkserver
 import os
-import signal
 import threading
 import time
 from pathlib import Path
@@ -98,30 +96,6 @@ def test_a_worker_that_dies_costs_only_its_log():
     processes = [text.removeprefix("at work as ") for text in heard]
     assert len(processes) == 5 and len(set(processes)) == 3  # a worker is used again until it dies
     assert str(os.getpid()) not in processes
-
-
-def test_a_killed_process_that_forks_workers_costs_no_log():
-    server = multiprocessing.forkserver._forkserver
-
-    def kill_server(outcome):
-        if outcome.task.index == 0:
-            os.kill(server._forkserver_pid, signal.SIGKILL)
-
-    engine = functools.partial(run_in_processes, num_workers=1)
-    outcomes = run_tasks(tasks_named("good", "good", "good"), engine, kill_server, lambda *_: None, outcome_or_death)
-    assert [outcome.exit_code for outcome in outcomes] == [0, 0, 0]
-
-
-def test_workers_that_cannot_be_started_are_failures_of_their_logs(monkeypatch):
-    def refuse(*_):
-        raise OSError(11, "Resource temporarily unavailable")
-
-    monkeypatch.setattr("multiprocessing.context.ForkServerProcess.start", refuse)
-    engine = functools.partial(run_in_processes, num_workers=2)
-    outcomes = run_tasks(tasks_named("a", "b"), engine, lambda _: None, lambda *_: None, outcome_or_death)
-    assert [outcome.exit_code for outcome in outcomes] == [5, 5]
-    says = "a: no worker process can be started (Resource temporarily unavailable); use fewer --workers"
-    assert outcomes[0].message == says
 
 
 def test_the_longest_log_comes_first_and_outcomes_keep_the_order():

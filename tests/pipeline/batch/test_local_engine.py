@@ -1,5 +1,6 @@
 """Worker processes of this machine that do not do what they are told to."""
 
+import multiprocessing.forkserver
 import os
 import signal
 import time
@@ -74,12 +75,24 @@ def test_a_worker_that_does_not_end_is_killed(monkeypatch):
         os.kill(pids[0], 0)
 
 
-def test_no_process_can_be_started(monkeypatch):
+def test_a_task_for_which_no_process_can_be_started_is_a_failure_of_its_own(monkeypatch):
     def refuse(process):
         raise OSError(11, "Resource temporarily unavailable")
 
     monkeypatch.setattr(ForkServerProcess, "start", refuse)
     before = dict(os.environ)
-    with pytest.raises(DeviceError, match=r"no worker process can be started \(Resource temp.*\); use fewer --workers"):
-        list(run_in_processes(bare_tasks(1), succeed, lambda task, told: None, 1))
+    outcomes = list(run_in_processes(bare_tasks(2), succeed, lambda task, told: None, 2))
+    says = "no worker process can be started (Resource temporarily unavailable); use fewer --workers"
+    assert [outcome.message for outcome in outcomes] == [f"log0.mcap: {says}", f"log1.mcap: {says}"]
+    assert [outcome.exit_code for outcome in outcomes] == [DeviceError.exit_code] * 2
     assert dict(os.environ) == before
+
+
+def test_a_killed_process_that_forks_workers_costs_no_log():
+    server = multiprocessing.forkserver._forkserver
+    outcomes = []
+    for outcome in run_in_processes(bare_tasks(3), succeed, lambda task, told: None, 1):
+        outcomes.append(outcome)
+        if len(outcomes) == 1:
+            os.kill(server._forkserver_pid, signal.SIGKILL)
+    assert [outcome.exit_code for outcome in outcomes] == [0, 0, 0]
