@@ -24,6 +24,7 @@ SOURCES = sorted(
 # Inside a layer, from the ground up: what stands on a floor may import what stands below it, and nothing beside it.
 FLOORS = {
     "pipeline": (
+        {"documents", "out_of_memory"},
         {"arrays", "config", "locks", "progress", "provenance", "plain_rows", "obstacle_file"},
         {"files"},
         {"manifest", "tables"},
@@ -166,7 +167,7 @@ def test_exceptions_from_the_limits_are_needed():
 
 def test_command_line_stays_thin():
     # most of it is help: a docstring with examples for each of the commands
-    assert len((ROOT / "cli.py").read_text(encoding="utf-8").splitlines()) < 360
+    assert len((ROOT / "cli.py").read_text(encoding="utf-8").splitlines()) < 380
 
 
 def test_top_level_is_what_the_plan_says():
