@@ -47,10 +47,17 @@ def min_ade(position_m: Tensor, weight: Tensor, truth_m: Tensor, is_known: Tenso
 
 
 def spread(position_m: Tensor, weight: Tensor) -> Tensor:
-    """Root of the weighted mean squared distance of the hypotheses to their mean, metres [B, A, T]."""
-    position_m = position_m.double()
-    mean_m = torch.einsum("bk,bkats->bats", weight.double(), position_m)
-    return _over_hypotheses(weight, (position_m - mean_m[:, None]).square().sum(dim=-1)).sqrt()
+    """Root of the weighted mean squared distance of the hypotheses to their mean, metres [B, A, T].
+
+    Hypotheses without the agent (NaN) are left out; NaN where no hypothesis has it.
+    """
+    is_there = position_m.isfinite().all(dim=-1)
+    share = weight.double()[:, :, None, None] * is_there
+    # weights of an agent that is in every hypothesis sum to one already, but for the last bit
+    share = torch.where(is_there.all(dim=1, keepdim=True), share, share / share.sum(dim=1, keepdim=True))
+    position_m = torch.where(is_there[..., None], position_m.double(), 0.0)
+    mean_m = (share[..., None] * position_m).sum(dim=1, keepdim=True)
+    return (share * (position_m - mean_m).square().sum(dim=-1)).sum(dim=1).sqrt()
 
 
 def masked_mean(values: Tensor, is_known: Tensor) -> Tensor:

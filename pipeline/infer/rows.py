@@ -5,6 +5,7 @@ import pyarrow as pa
 import torch
 from torch import Tensor
 
+from cadence import metrics
 from pipeline.associations import WayWindows
 from pipeline.windows import Grid, MissionWindows
 from schemas.tables import WINDOWS, hypotheses_schema
@@ -50,7 +51,8 @@ def hypothesis_rows(
 
 def window_rows(windows: MissionWindows, part: Tensor, position: Tensor, weight: Tensor, status: list[list[str]]) -> pa.Table:
     """WINDOWS rows of every agent."""
-    spread = _spread_m(position[:, :, :, windows.batch.origin_index], weight)
+    now = windows.batch.origin_index
+    spread = metrics.spread(position[:, :, :, now : now + 1], weight)[..., 0]
     detections = windows.batch.detections[part]
     age = -torch.where(detections.is_observed, detections.time_s, -torch.inf).amax(-1)
     rows = []
@@ -79,14 +81,3 @@ def with_association(rows: pa.Table, ways: WayWindows, part: Tensor) -> pa.Table
         index = WINDOWS.get_field_index(name)
         rows = rows.set_column(index, WINDOWS.field(name), pa.array(value[window].reshape(-1), from_pandas=True))
     return rows
-
-
-def _spread_m(position_m: Tensor, weight: Tensor) -> Tensor:
-    """Spread [B, A] of positions [B, K, A, 2] under weights [B, K]; hypotheses without the agent (NaN) are left out."""
-    is_there = position_m.isfinite().all(-1)
-    share = weight[:, :, None] * is_there
-    # An agent of every hypothesis keeps the weights as they are, to the last bit.
-    share = torch.where(is_there.all(1, keepdim=True), share, share / share.sum(1, keepdim=True))
-    position_m = torch.where(is_there[..., None], position_m, 0.0)
-    mean = (share[..., None] * position_m).sum(1, keepdim=True)
-    return (share * ((position_m - mean) ** 2).sum(-1)).sum(1).sqrt()

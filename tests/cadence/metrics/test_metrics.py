@@ -232,3 +232,10 @@ def test_spread_of_a_ring() -> None:
     angle = torch.linspace(0, 2 * math.pi, 9)[:-1]
     ring = 5.0 * torch.stack([angle.cos(), angle.sin()], dim=-1)[None, :, None, None]
     assert metrics.spread(ring, uniform(1, 8)).item() == pytest.approx(5.0)
+
+
+def test_spread_counts_only_hypotheses_that_have_the_agent() -> None:
+    position = torch.tensor([[0.0, 0.0], [4.0, 0.0], [torch.nan, torch.nan]])[None, :, None, None]
+    found = metrics.spread(position, torch.tensor([[0.1, 0.3, 0.6]]))
+    assert found.item() == pytest.approx(4.0 * (0.25 * 0.75) ** 0.5)
+    assert metrics.spread(torch.full((1, 3, 1, 1, 2), torch.nan), uniform(1, 3)).isnan().all()
