@@ -1,26 +1,44 @@
 """Files that are whole or not there, and their hashes."""
 
 import contextlib
+import functools
 import hashlib
 import os
 import secrets
 import shutil
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
 from cadence.errors import DeviceError, InputError
 from pipeline.locks import clear_abandoned, locked
 
+_SETTLED_NS = 2_000_000_000
+"""Stamps are as coarse as this on some file systems (FAT); most are finer."""
+
 
 def hash_file(path: Path) -> str:
-    """SHA-256 of the content, read in blocks; `InputError` where the file is absent or cannot be read."""
+    """SHA-256 of the content; `InputError` where the file is absent or cannot be read.
+
+    A file that was hashed before is read again only where its size, its stamps or its identity are others. The stamps of a
+    file that has just been written say too little: it may be written again within one tick of its clock.
+    """
     try:
-        with path.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
+        found = path.stat()
+        changed_ns = max(found.st_mtime_ns, found.st_ctime_ns)
+        read = _digest if time.time_ns() - changed_ns > _SETTLED_NS else _digest.__wrapped__
+        return read(path, (found.st_dev, found.st_ino, found.st_size, found.st_mtime_ns, found.st_ctime_ns))
     except FileNotFoundError as error:
         raise InputError(f"{path}: not found; check the path, or run the stage that writes it first") from error
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); check that it is a file and its permissions") from error
+
+
+@functools.lru_cache(maxsize=1024)
+def _digest(path: Path, identity: tuple[int, ...]) -> str:
+    """SHA-256 of what lies at `path`, read in blocks; `identity` is what the file system says of it."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def write_atomic(path: Path, text: str) -> None:

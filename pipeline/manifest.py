@@ -57,12 +57,14 @@ def run_stage(
     inputs: Sequence[Path],
     body: Callable[[Path], JsonObject],
     force: bool = False,
+    facts: JsonObject | None = None,
 ) -> StageResult:
     """Run `body` for `stage` unless an earlier run with the same inputs, configuration and versions left its outputs intact.
 
     `body` gets an empty temporary folder inside `directory`, writes its output files there and returns the summary. Its
     files are then renamed into `directory`, the manifest last: a killed run leaves nothing that looks finished. Files that
     an earlier run of the stage left and this one did not write again are removed: nobody shall read a mixture.
+    `facts` are what the results depend on of files that are no inputs as a whole, as the time at which the log begins.
     Raises `InputError` where an input is stale (`check_chain`).
     """
     digests = {path.name: hash_file(path) for path in inputs}
@@ -72,6 +74,7 @@ def run_stage(
         "config": config_as_dict(config),
         "inputs": digests,
         "versions": versions(),
+        **({"facts": dict(facts)} if facts else {}),
     }
     clear_abandoned(directory, f".{stage}.")
     earlier = read_manifest(stage, directory)

@@ -1,6 +1,8 @@
 """From a log to what a person opens: everything is there, readable by others, repeatable, and the log itself is untouched."""
 
+import hashlib
 import json
+import shutil
 from collections import Counter
 from pathlib import Path
 
@@ -9,7 +11,10 @@ from fixtures.line_logs import straight_line, write_log
 from mcap.reader import make_reader
 
 import cli
+from pipeline import files
+from pipeline.evaluate.stage import EvaluateConfig, evaluate
 from pipeline.files import hash_file
+from pipeline.progress import Progress
 
 ROOT = Path(__file__).resolve().parents[1]
 SHIPPED = sorted((ROOT / "cadence" / "checkpoints").glob("*.safetensors"))
@@ -80,6 +85,55 @@ def test_stages_one_by_one_give_what_run_gives(log, tmp_path, capsys):
         assert cli.main([command, mission, *settings]) == 0
     for name in RESULTS:
         assert hash_file(Path(mission) / name) == hash_file(tmp_path / "run" / "walk" / name), name
+
+
+def test_a_run_hashes_the_log_once(log, tmp_path, capsys, monkeypatch):
+    hashed = []
+
+    def digest(file, *name):
+        hashed.append(file.name)
+        return real(file, *name)
+
+    real = hashlib.file_digest
+    monkeypatch.setattr(hashlib, "file_digest", digest)
+    monkeypatch.setattr(files, "_SETTLED_NS", 0)
+    run(capsys, log, tmp_path / "out", *BANK)
+    assert hashed.count(str(log)) == 1
+
+
+def test_every_stage_makes_the_same_of_its_declared_inputs_alone(tmp_path, capsys):
+    simulate = ["simulate", "--out", str(tmp_path / "logs"), "--set", "simulate.patrol.duration_s=900", "--json", "-q"]
+    assert cli.main(simulate) == 0
+    (log,) = json.loads(capsys.readouterr().out)["outputs"]
+    grid = ["--set", "infer.grid.step_s=5", "--set", "infer.grid.context_steps=160"]  # of which evaluate hears from infer
+    settings = [*BANK, *SMALL[:4], *grid, "--quiet"]
+    assert cli.main(["run", log, "--out", str(tmp_path / "out"), *settings]) == 0
+    mission = tmp_path / "out" / Path(log).stem
+    evaluate(mission, EvaluateConfig(num_resamples=20), Progress(quiet=True))
+    for stage in ("extract", "infer", "export", "report", "evaluate"):
+        manifest = json.loads((mission / f"{stage}.manifest.json").read_text())
+        alone = tmp_path / stage / mission.name
+        alone.mkdir(parents=True)
+        for name in manifest["inputs"]:
+            if (mission / name).is_file():  # others belong to the program
+                shutil.copy(mission / name, alone / name)
+        if stage == "evaluate":
+            evaluate(alone, EvaluateConfig(num_resamples=20), Progress(quiet=True))
+        else:
+            assert cli.main([stage, str(alone), *settings]) == 0
+        made = json.loads((alone / f"{stage}.manifest.json").read_text())
+        assert made["outputs"] == manifest["outputs"], stage
+
+
+def test_hypotheses_depend_on_the_beginning_of_the_log(log, tmp_path, capsys):
+    run(capsys, log, tmp_path / "out", *BANK)
+    mission = tmp_path / "out" / "walk"
+    catalogue = json.loads((mission / "catalogue.json").read_text())
+    for changed, status in (({"path": str(tmp_path / "elsewhere.mcap")}, "skipped"), ({"start_ns": 0}, "done")):
+        (mission / "ingest.manifest.json").unlink(missing_ok=True)  # it would vouch for the catalogue as it was
+        (mission / "catalogue.json").write_text(json.dumps({**catalogue, **changed}))
+        assert cli.main(["infer", str(mission), *SMALL, *BANK]) == 0
+        assert json.loads(capsys.readouterr().out)["status"] == status
 
 
 @pytest.mark.skipif(not SHIPPED, reason="this checkout holds no trained checkpoint")

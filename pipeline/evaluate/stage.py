@@ -29,7 +29,7 @@ from pipeline.evaluate.scores import Cells, Draw, IsInside, score_in_chunks
 from pipeline.evaluate.tables import OWN_NAME, ScoredMission, as_csv, as_json, as_markdown, headline, pool
 from pipeline.files import write_atomic
 from pipeline.forecast.stage import ForecastConfig, evaluate_forecasts
-from pipeline.manifest import StageResult, check_chain, read_manifest, run_stage
+from pipeline.manifest import StageResult, check_chain, manifest_path, read_manifest, run_stage
 from pipeline.missions import is_mission_directory
 from pipeline.obstacle_file import OBSTACLES_NAME, read_obstacles
 from pipeline.progress import Progress
@@ -110,7 +110,8 @@ def evaluate(directory: Path, config: EvaluateConfig, progress: Progress, force:
             f"{inputs[-1]}: not found, so there is nothing to score against; name a truth channel in [[extract.truth]] "
             "or thin a dense one (extract.thinning), then run extract and infer again"
         )
-    inputs += [path for name in (OBSTACLES_NAME, LABELS_NAME) if (path := directory / name).is_file()]
+    more = (directory / OBSTACLES_NAME, directory / LABELS_NAME, manifest_path("infer", directory))
+    inputs += [path for path in more if path.is_file()]
 
     def body(work: Path) -> Mapping[str, Any]:
         scored = score_mission(directory, config, progress)

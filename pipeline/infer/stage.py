@@ -38,9 +38,9 @@ def infer(directory: Path, config: InferConfig, progress: Progress, force: bool 
         inputs += [weights, weights.with_suffix(".json")]
     refuse_unread(config.checkpoint, config)
     detections, frame = read_table(inputs[0], "detections")
+    start_ns = _mission_start_ns(directory, detections)
 
     def body(folder: Path) -> dict[str, Any]:
-        start_ns = _mission_start_ns(directory, detections)
         plan = _Plan.of(config, detections, read_obstacles(inputs[1]), start_ns)
         summary = _draw(plan, str(detections["log_id"][0]), folder, frame, progress)
         if plan.seen.sources.association is not None:
@@ -58,7 +58,9 @@ def infer(directory: Path, config: InferConfig, progress: Progress, force: bool 
             **plan.about,
         }
 
-    return run_stage("infer", directory, config=config, inputs=inputs, body=body, force=force)
+    # the catalogue itself is no input: it names the place of the log, and a log that was moved is not inferred again
+    facts = {"start_ns": start_ns}
+    return run_stage("infer", directory, config=config, inputs=inputs, body=body, force=force, facts=facts)
 
 
 def _mission_start_ns(directory: Path, detections: pa.Table) -> int:

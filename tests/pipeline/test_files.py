@@ -1,10 +1,13 @@
+import hashlib
 import os
 import stat
+import time
 
 import pytest
 
 from cadence.errors import DeviceError
-from pipeline.files import replacing, write_atomic
+from pipeline import files
+from pipeline.files import hash_file, replacing, write_atomic
 
 
 def names_in(folder):
@@ -53,3 +56,30 @@ def test_the_folder_of_a_first_draft_that_failed_goes_too(tmp_path):
     with pytest.raises(ValueError), replacing(tmp_path / "cache" / "weights.bin"):
         raise ValueError
     assert names_in(tmp_path) == []
+
+
+def test_a_changed_file_is_hashed_again_also_with_its_old_size_and_time(tmp_path, monkeypatch):
+    monkeypatch.setattr(files, "_SETTLED_NS", 0)
+    path = tmp_path / "log.mcap"
+    path.write_bytes(b"one")
+    before, times = hash_file(path), path.stat()
+    time.sleep(0.02)  # more than a tick of the kernel's clock
+    path.write_bytes(b"two")
+    os.utime(path, ns=(times.st_atime_ns, times.st_mtime_ns))
+    assert hash_file(path) == hashlib.sha256(b"two").hexdigest() != before
+
+
+def test_a_file_that_has_just_been_written_is_read_each_time(tmp_path):
+    path = tmp_path / "log.mcap"
+    for content in (b"one", b"two"):  # within one tick, as far as the stamps go
+        path.write_bytes(content)
+        assert hash_file(path) == hashlib.sha256(content).hexdigest()
+
+
+def test_a_settled_file_is_read_once(tmp_path, monkeypatch):
+    path = tmp_path / "log.mcap"
+    path.write_bytes(b"one")
+    reads = []
+    monkeypatch.setattr(files, "_SETTLED_NS", 0)
+    monkeypatch.setattr(hashlib, "file_digest", lambda file, name: reads.append(name) or hashlib.new(name, file.read()))
+    assert [hash_file(path) for _ in range(3)] == [hashlib.sha256(b"one").hexdigest()] * 3 and len(reads) == 1
