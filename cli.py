@@ -34,8 +34,8 @@ app = typer.Typer(
       cadence run LOG.mcap --out results    everything: side file for Foxglove, layout, report
       cadence COMMAND --help                options and examples of one command
 
-    Exit codes: 0 ok, 1 defect, 2 wrong call, 3 unusable input, 4 configuration, 5 device or storage, 6 quality gate,
-    7 damaged input, 8 suspected input, 130 interrupted.
+    Exit codes: 0 ok, 1 defect, 2 wrong call, 3 unusable input, 4 configuration, 5 device or storage, 7 damaged input,
+    8 suspected input, 130 interrupted.
     """,
 )
 

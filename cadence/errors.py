@@ -39,12 +39,6 @@ class DeviceError(CadenceError):
     exit_code = 5
 
 
-class QualityGateError(CadenceError):
-    """A result was produced but does not meet the gate that was asked for."""
-
-    exit_code = 6
-
-
 class PartialInputError(CadenceError):
     """A log is damaged: what is sound was read, some of it is lost."""
 

@@ -1,15 +1,13 @@
 """Arrow schemas of the files between the stages. Times int64 ns, positions float64 metres in the mission frame.
 
-Every file carries the schema metadata keys `cadence.table`, `cadence.version` and `cadence.frame` (JSON: see `FRAME_KEYS`).
+Every file carries the schema metadata keys `cadence.table`, `cadence.version` and `cadence.frame` (JSON: `frame_id`, the
+name of the mission frame, and for georeferenced logs its datum, `latitude_deg` and `longitude_deg`, else null).
 """
 
 import pyarrow as pa
 
 VERSION = 1
 """Raised when a column changes meaning; readers refuse other versions."""
-
-FRAME_KEYS = ("frame_id", "latitude_deg", "longitude_deg")
-"""Keys of the `cadence.frame` JSON: the name of the mission frame and, for georeferenced logs, its datum (else null)."""
 
 DETECTIONS = pa.schema(
     [

@@ -6,7 +6,6 @@ continuations drawn with these weights (a particle filter whose particles are re
 1964, Watson 1964). No model of motion is involved, so that a learned model that does not beat it has learned paths only.
 """
 
-import dataclasses
 import math
 from dataclasses import dataclass
 from typing import Self
@@ -77,16 +76,6 @@ class LibraryConfig:
         positive = (self.sigma, self.age_sigma, self.count_sigma, self.elapsed_sigma, self.num_detections, self.stride)
         if min(positive) <= 0 or self.lag_growth < 1.0:
             raise ValueError("LibraryConfig: sigmas, num_detections and stride must be positive, lag_growth 1 at least")
-
-
-_OFF = math.inf
-PLAIN = LibraryConfig(
-    sigma=8.5, sigma_per_lag=0.0, lag_growth=1.0, age_sigma=_OFF, count_sigma=_OFF, elapsed_sigma=_OFF, goal_penalty=0.0,
-    fade=0.0, min_episodes=0.0, is_systematic=False,
-)  # fmt: skip
-"""The library at its simplest: one kernel over the last eight detections, continuations as they were recorded."""
-SHIFTED = dataclasses.replace(PLAIN, sigma_per_lag=0.28, goal_penalty=2.0, fade=100.0, is_systematic=True)
-"""Wider kernels for older detections, a penalty for another known goal, and a shift onto the last detection."""
 
 
 @dataclass(frozen=True, eq=False)

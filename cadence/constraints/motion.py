@@ -1,4 +1,4 @@
-"""How tracks move: step lengths, speeds, turns, and the cost of moving faster than the target can."""
+"""Step lengths of tracks, and the cost of moving faster than the target can."""
 
 from dataclasses import dataclass
 
@@ -10,43 +10,6 @@ def step_lengths(position_m: Tensor) -> Tensor:
     """Distance between consecutive steps [..., T-1] in metres, of tracks [..., T, 2]."""
     length: Tensor = torch.linalg.vector_norm(position_m[..., 1:, :] - position_m[..., :-1, :], dim=-1)
     return length
-
-
-def speeds(position_m: Tensor, step_s: float) -> Tensor:
-    """Speed between consecutive steps [..., T-1] in m/s."""
-    return step_lengths(position_m) / step_s
-
-
-def turn_angles(position_m: Tensor) -> Tensor:
-    """Change of heading at every inner step [..., T-2] in radians, (-pi, pi], left positive; zero where a step is zero."""
-    step = position_m[..., 1:, :] - position_m[..., :-1, :]
-    before, after = step[..., :-1, :], step[..., 1:, :]
-    cross = before[..., 0] * after[..., 1] - before[..., 1] * after[..., 0]
-    return torch.atan2(cross, (before * after).sum(dim=-1))
-
-
-@dataclass(frozen=True, eq=False)
-class MotionStatistics:
-    """Summary per track, each [...]: speeds in m/s, turn rate in rad/s (root mean square)."""
-
-    mean_speed_mps: Tensor
-    max_speed_mps: Tensor
-    rms_turn_radps: Tensor
-    share_above: Tensor
-    """Share of the steps above the given maximum speed."""
-
-
-def motion_statistics(position_m: Tensor, step_s: float, max_speed_mps: float = float("inf")) -> MotionStatistics:
-    """Speed and turn statistics of tracks [..., T, 2], T at least 2."""
-    speed = speeds(position_m, step_s)
-    turn = turn_angles(position_m) / step_s
-    rms = turn.square().mean(dim=-1).sqrt() if turn.shape[-1] else torch.zeros_like(speed[..., 0])
-    return MotionStatistics(speed.mean(dim=-1), speed.amax(dim=-1), rms, share_above(position_m, step_s, max_speed_mps))
-
-
-def share_above(position_m: Tensor, step_s: float, max_speed_mps: float) -> Tensor:
-    """Share of the steps [...] that are faster than `max_speed_mps`."""
-    return (speeds(position_m, step_s) > max_speed_mps).to(position_m.dtype).mean(dim=-1)
 
 
 @dataclass(frozen=True)

@@ -107,10 +107,6 @@ class AbsoluteSampling:
             raise ValueError("num_steps, chunk, length_steps and amplitude must be positive, floor not negative")
 
 
-PAPER_SAMPLING = AbsoluteSampling(inpainting="overwrite", guidance="paper")
-"""The paper's procedure."""
-
-
 @dataclass(frozen=True, eq=False)
 class AbsoluteModel:
     """A trained network as an `Estimator`.

@@ -40,11 +40,6 @@ def swerling_probability(distance_m: Float64s, half_range_m: Float64s) -> Float6
     return np.where(ratio <= 2.5, probability, 0.0)
 
 
-def linear_probability(distance_m: Float64s, certain_range_m: Float64s) -> Float64s:
-    """Detection probability 1 up to `certain_range_m`, falling linearly to 0 at three times that (the Prison Escape law)."""
-    return np.clip(1.5 - 0.5 * distance_m / certain_range_m, 0.0, 1.0)
-
-
 def measurement_covariance(offset_m: Float64s, range_sigma_m: Float64s, bearing_sigma_rad: Float64s) -> Float64s:
     """Covariance [..., 2, 2] of a position measured in range and bearing along `offset_m` [..., 2] (target minus sensor).
 

@@ -1,20 +1,17 @@
-"""Messages of a side file: hypotheses (lossless, and read back), numbers a tick, detections, heat map, frames."""
+"""Messages of a side file: hypotheses (lossless), numbers a tick, detections, heat map, frames."""
 
 import math
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from cadence.errors import InputError
 from pipeline.export import numbers
 from pipeline.export.occupancy import Occupancy, future_occupancy
 from pipeline.export.playback import LiveAgent, Tick
-from pipeline.logs.reader import open_log
 from pipeline.logs.wire import field
 from pipeline.logs.writer import foxglove_class
-from pipeline.results import AgentHypotheses, MissionHypotheses, WindowHypotheses
+from pipeline.results import AgentHypotheses, WindowHypotheses
 from pipeline.tables import Frame
 from schemas import channels
 from schemas.channels import message_class
@@ -58,58 +55,6 @@ def _encode_agent(agent: AgentHypotheses) -> bytes:
     )
     position: bytes = np.ascontiguousarray(agent.position_m, dtype="<f4").tobytes()
     return bytes(head.SerializeToString()) + (field(9, position) if position else b"")
-
-
-def read_hypotheses(path: Path) -> MissionHypotheses:
-    """The hypotheses of a side file (or a combined file), equal to the tables that they were written from.
-
-    Raises `InputError` where the file is no MCAP, is damaged, or holds no hypotheses.
-    """
-    log = open_log(path)
-    if not log.health.is_complete:
-        raise InputError(f"{path}: is damaged ({'; '.join(log.health.problems)}); export it again")
-    kind = message_class("cadence.Hypotheses")
-    messages = [kind.FromString(raw.data) for raw in log.messages({channels.HYPOTHESES.topic})]
-    if not messages:
-        raise InputError(f"{path}: holds no {channels.HYPOTHESES.topic}; is it a file that cadence export wrote?")
-    first = messages[0]
-    frame = Frame(first.frame_id, _optional(first, "latitude_deg"), _optional(first, "longitude_deg"))
-    windows = tuple(_decode_window(message) for message in messages)
-    agent_ids = tuple(sorted({agent.agent_id for window in windows for agent in window.agents}))
-    return MissionHypotheses(frame, agent_ids, windows)
-
-
-def _decode_window(message: Any) -> WindowHypotheses:
-    return WindowHypotheses(
-        log_id=message.log_id,
-        window=message.window,
-        origin_ns=message.origin_ns,
-        step_ns=message.step_ns,
-        origin_index=message.origin_index,
-        num_steps=message.num_steps,
-        hypothesis=np.array(message.hypothesis, dtype=np.int32),
-        weight=np.array(message.weight, dtype=np.float32),
-        agents=tuple(_decode_agent(agent, message.num_steps) for agent in message.agents),
-    )
-
-
-def _decode_agent(agent: Any, num_steps: int) -> AgentHypotheses:
-    return AgentHypotheses(
-        agent_id=agent.id,
-        status=agent.status,
-        advice=agent.advice or None,
-        num_detections=agent.num_detections,
-        age_s=_optional(agent, "age_s"),
-        spread_m=_optional(agent, "spread_m"),
-        datum_m=(agent.datum_x_m, agent.datum_y_m),
-        position_m=np.array(agent.position_m, dtype=np.float32).reshape(-1, num_steps, 2),
-        probability=_optional(agent, "probability"),
-        association_entropy_bits=_optional(agent, "association_entropy_bits"),
-    )
-
-
-def _optional(message: Any, name: str) -> float | None:
-    return float(getattr(message, name)) if message.HasField(name) else None
 
 
 def encode_agents(tick: Tick, time_ns: int) -> bytes:

@@ -85,10 +85,6 @@ class Motion:
         back = self.rotation.transpose(0, 2, 1)
         return Motion(back, -np.einsum("nij,nj->ni", back, self.translation_m), self.is_known)
 
-    def applied(self, position_m: Float64s) -> Float64s:
-        """Positions [M, 3] of the inner frame in the outer one."""
-        return np.asarray(np.einsum("nij,nj->ni", self.rotation, position_m) + self.translation_m)
-
 
 @dataclass(frozen=True)
 class TransformTree:

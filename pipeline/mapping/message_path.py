@@ -166,11 +166,6 @@ class MessagePath:
     text: str
     steps: tuple[Step, ...]
 
-    @property
-    def is_plural(self) -> bool:
-        """Whether the path may give any number of values (it holds a slice or a filter)."""
-        return self._chain is None
-
     @functools.cached_property
     def _chain(self) -> tuple[Callable[[Any], Any], ...] | None:
         """The steps one after the other, where each gives one value."""

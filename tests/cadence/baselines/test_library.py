@@ -1,17 +1,24 @@
 """The trajectory library on small recordings whose answer is known."""
 
 import dataclasses
+import math
 
 import numpy as np
 import pytest
 import torch
 
-from cadence.baselines.library import PLAIN, SHIFTED, LibraryConfig, TrajectoryLibrary, _draw, _flattened, spaced_lags
+from cadence.baselines.library import LibraryConfig, TrajectoryLibrary, _draw, _flattened, spaced_lags
 from cadence.recordings import ForecastWindows, Recordings, choose_windows, cut_windows
 from cadence.types import Estimator
 
 STEP_M = 100.0
 SHARP = dataclasses.replace(LibraryConfig(), sigma=1.0, sigma_per_lag=0.02, stride=1)
+
+PLAIN = LibraryConfig(
+    sigma=8.5, sigma_per_lag=0.0, lag_growth=1.0, age_sigma=math.inf, count_sigma=math.inf, elapsed_sigma=math.inf,
+    goal_penalty=0.0, fade=0.0, min_episodes=0.0, is_systematic=False,
+)  # fmt: skip
+SHIFTED = dataclasses.replace(PLAIN, sigma_per_lag=0.28, goal_penalty=2.0, fade=100.0, is_systematic=True)
 
 
 def recorded(paths: list[np.ndarray], rate: float = 0.3, goals: np.ndarray | None = None) -> Recordings:

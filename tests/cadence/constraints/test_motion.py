@@ -1,4 +1,4 @@
-"""Steps, speeds and turns by hand; the speed hinge against autograd, with parked tracks."""
+"""Steps by hand; the speed hinge against autograd, with parked tracks."""
 
 import itertools
 import math
@@ -6,35 +6,13 @@ import math
 import pytest
 import torch
 
-from cadence.constraints.motion import (
-    SpeedConstraint,
-    motion_statistics,
-    share_above,
-    speeds,
-    step_lengths,
-    turn_angles,
-)
+from cadence.constraints.motion import SpeedConstraint, step_lengths
 
 L_TRACK = torch.tensor([[0.0, 0.0], [3.0, 4.0], [6.0, 8.0], [2.0, 11.0], [2.0, 11.0]], dtype=torch.float64)
 
 
-def test_steps_speeds_and_turns_by_hand():
+def test_steps_by_hand():
     assert step_lengths(L_TRACK).tolist() == [5, 5, 5, 0]
-    assert speeds(L_TRACK, 2.0).tolist() == [2.5, 2.5, 2.5, 0]
-    assert turn_angles(L_TRACK).tolist() == pytest.approx([0, math.pi / 2, 0])
-    assert share_above(L_TRACK, 2.0, 2.4).item() == 0.75
-
-
-def test_statistics_per_track():
-    stats = motion_statistics(torch.stack([L_TRACK, torch.zeros_like(L_TRACK)]), 2.0, 2.4)
-    assert stats.mean_speed_mps.tolist() == [1.875, 0]
-    assert stats.max_speed_mps.tolist() == [2.5, 0]
-    assert stats.share_above.tolist() == [0.75, 0]
-    assert stats.rms_turn_radps.tolist() == pytest.approx([math.sqrt((math.pi / 4) ** 2 / 3), 0])
-
-
-def test_two_steps_have_no_turn():
-    assert motion_statistics(L_TRACK[:2], 1.0).rms_turn_radps.item() == 0
 
 
 def test_gradient_is_that_of_the_cost():

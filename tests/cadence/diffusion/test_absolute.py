@@ -8,7 +8,6 @@ import torch
 
 from cadence.constraints.obstacles import Obstacles
 from cadence.diffusion.absolute import (
-    PAPER_SAMPLING,
     AbsoluteConfig,
     AbsoluteModel,
     AbsoluteSampling,
@@ -24,6 +23,7 @@ NETWORK = TrajectoryNetworkConfig(
 )
 CONFIG = AbsoluteConfig(NETWORK, step_s=2.0, centre_m=(100.0, 50.0), scale_m=200.0, age_scale_steps=32.0)
 FAST = AbsoluteSampling("ddim", 4)
+PAPER_SAMPLING = AbsoluteSampling(inpainting="overwrite", guidance="paper")
 
 
 def batch(b=3, a=2, n=4, seed=0, origin=0, num_steps=16):

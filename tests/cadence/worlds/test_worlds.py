@@ -12,7 +12,6 @@ from cadence.worlds.route import Agility, Craft, RouteField, RouteGrid, keep_out
 from cadence.worlds.sensors import (
     Sortie,
     draw_noise,
-    linear_probability,
     measurement_covariance,
     square_search,
     sweep_track,
@@ -161,9 +160,6 @@ class TestSensors:
         assert probability[0] > 0.99
         assert 0.0 < probability[3] < 0.01
         assert probability[4] == 0.0
-
-    def test_prison_law(self) -> None:
-        assert linear_probability(np.array([0.0, 10.0, 20.0, 30.0, 99.0]), np.array(10.0)).tolist() == [1, 1, 0.5, 0, 0]
 
     def test_covariance_lies_along_and_across_the_line_of_sight(self) -> None:
         sigma, bearing = np.array([20.0, 20.0, 20.0]), np.array([0.01, 0.01, 0.01])

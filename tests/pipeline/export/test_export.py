@@ -22,6 +22,7 @@ from fixtures.mission import (
     STRIDE_NS,
     build_mission,
 )
+from fixtures.side_files import read_hypotheses
 from foxglove_schemas_protobuf.GeoJSON_pb2 import GeoJSON
 from foxglove_schemas_protobuf.Grid_pb2 import Grid
 from foxglove_schemas_protobuf.LinePrimitive_pb2 import LinePrimitive
@@ -32,7 +33,6 @@ from mcap_protobuf.decoder import DecoderFactory
 
 from cadence.errors import InputError
 from pipeline.export import numbers
-from pipeline.export.messages import read_hypotheses
 from pipeline.export.playback import Scene, plan_ticks
 from pipeline.export.stage import ExportConfig, export, num_vertices
 from pipeline.frames import to_local

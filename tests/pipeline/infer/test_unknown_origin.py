@@ -9,6 +9,7 @@ import pytest
 import torch
 from fixtures.mission import build_mission
 from fixtures.paper_checkpoint import checkpoint
+from fixtures.side_files import read_hypotheses
 from fixtures.unknown_origin import (
     CLUTTERED,
     CONFIG,
@@ -28,7 +29,6 @@ from cadence.errors import InputError
 from cadence.types import Detections, HypothesisSet, WindowBatch
 from pipeline import associations
 from pipeline.associations import Association, WayWindows, build_way_windows, shared_out, tell_sources
-from pipeline.export.messages import read_hypotheses
 from pipeline.export.stage import ExportConfig, export
 from pipeline.infer.config import InferConfig
 from pipeline.infer.draws import draw_ways

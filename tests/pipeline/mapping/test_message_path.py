@@ -73,12 +73,6 @@ def test_quoted_names() -> None:
     assert parse_path('"odd name".x').values(MESSAGE) == [1.5]
 
 
-def test_plural_only_with_slice_or_filter() -> None:
-    assert not parse_path("objects[1].width").is_plural
-    assert parse_path("objects[:].width").is_plural
-    assert parse_path("header{total==4}.stamp").is_plural
-
-
 @pytest.mark.parametrize(
     "text",
     [
