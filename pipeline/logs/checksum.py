@@ -24,6 +24,8 @@ class DataChecksum:
 
     def _is_stated(self) -> bool:
         """Whether there is one in the end mark of the data, whose place is known by the summary behind it."""
+        if self.walk.limit - DATA_END.size < self.walk.position:
+            return False
         end_mark = DATA_END.unpack(self.walk.read(self.walk.limit - DATA_END.size, DATA_END.size))
         return end_mark != (Opcode.DATA_END, 4, 0)
 

@@ -14,7 +14,7 @@ def container_remarks(path: Path) -> tuple[str, ...]:
     A damaged end is not remarked on here: the health of the log says what is wrong with it.
     """
     with path.open("rb") as file:
-        summary, _ = read_summary(file, path.stat().st_size)
+        summary, _ = read_summary(file, 0, path.stat().st_size)
     if summary is None:
         return ()
     if not summary.statistics and not summary.chunks and not summary.channels:

@@ -8,11 +8,13 @@ from mcap.opcode import Opcode
 
 from pipeline.logs.plan import is_span
 from pipeline.logs.records import CHUNK_HEAD, HEAD, MAGIC, TEXT_MAGIC, DamagedRecord, parse_message_index
-from pipeline.logs.resync import find_records
+from pipeline.logs.resync import find_recording, find_records
 from pipeline.logs.rows import Index
 
 MAX_SMALL_BYTES: Final = 2**26
 """Channels, schemas, metadata and message indexes that are larger are not believed."""
+
+_READ_BYTES: Final = 2**20
 
 
 class RecordHead(NamedTuple):
@@ -26,30 +28,41 @@ class RecordHead(NamedTuple):
 
 
 class FileWalk:
-    """Stands at one record of the data section after the other.
+    """Stands at one record of a recording after the other.
 
-    size      of the file
-    limit     where the data section ends at the latest
-    places    sorted offsets where records are known to begin; empty where no index tells
-    position  of the record at which the walk stands
+    begin, end  bytes of the file in which the recording lies
+    limit       where the walk ends: behind the data where an index says where that is, else at the end
+    places      sorted offsets where records are known to begin; empty where no index tells
+    position    of the record at which the walk stands
+    unsure      byte from which on nothing tells that the record before the position was one: it may hide a recording's end
     """
 
-    def __init__(self, file: BinaryIO, size: int, limit: int, places: Sequence[int]) -> None:
-        self.file, self.size, self.limit, self.places = file, size, limit, places
-        self.is_text = self.read(0, len(TEXT_MAGIC)) == TEXT_MAGIC
-        self.position = len(TEXT_MAGIC if self.is_text else MAGIC)
+    def __init__(self, file: BinaryIO, begin: int, end: int, limit: int, places: Sequence[int]) -> None:
+        self.file, self.begin, self.end, self.limit, self.places = file, begin, end, limit, places
+        self.is_text = self.read(begin, len(TEXT_MAGIC)) == TEXT_MAGIC
+        self.position = begin + len(TEXT_MAGIC if self.is_text else MAGIC)
+        self.unsure = self.position
 
     def read(self, offset: int, length: int) -> bytes:
-        """These bytes of the file; `DamagedRecord` where it does not have them."""
+        """These bytes of the file; `DamagedRecord` where the recording does not have them."""
         self.file.seek(offset)
-        data = self.file.read(length)
+        data = self.file.read(max(0, min(length, self.end - offset)))
         if len(data) != length:
             raise DamagedRecord("the file ends inside a record")
         return data
 
     def is_over(self) -> bool:
-        """Whether the data section, as far as its end is known, has been passed."""
+        """Whether the walk has come to its end."""
         return self.position >= self.limit
+
+    def go(self, position: int, is_sure: bool) -> None:
+        """Stand at the record at `position`, behind one that is sure to be whole, or not."""
+        self.unsure, self.position = position if is_sure else self.position, position
+
+    def is_at_magic(self) -> bool:
+        """Whether magic stands at the position, and no record."""
+        self.file.seek(self.position)
+        return self.file.read(len(MAGIC)) == MAGIC
 
     def head(self) -> RecordHead:
         """The head of the record at the position."""
@@ -74,17 +87,37 @@ class FileWalk:
 
     def span_at(self, offset: int) -> tuple[int, int] | None:
         """The time span that the head of a chunk at `offset` states; None where there is no such head."""
-        self.file.seek(offset)
-        data = self.file.read(HEAD.size + CHUNK_HEAD.size)
-        if len(data) < HEAD.size + CHUNK_HEAD.size or data[0] != Opcode.CHUNK:
+        try:
+            data = self.read(offset, HEAD.size + CHUNK_HEAD.size)
+        except DamagedRecord:
+            return None
+        if data[0] != Opcode.CHUNK:
             return None
         start, end, *_ = CHUNK_HEAD.unpack_from(data, HEAD.size)
         return (start, end) if is_span(start, end) else None
 
-    def pass_damage(self, channel_ids: Collection[int]) -> None:
-        """Leave the position for the next place that can be believed: the index tells it, or records are searched for."""
+    def pass_damage(self, channel_ids: Collection[int]) -> int | None:
+        """Leave the position for the next place that can be believed: the index tells it, or records are searched for.
+
+        Returns where another recording begins in what was passed or in the record before it, if one does: a recording that
+        was cut off takes the beginning of the next one for its own.
+        """
         following = bisect.bisect_right(self.places, self.position)
         if following < len(self.places):
-            self.position = self.places[following]
+            place = self.places[following]
         else:
-            self.position = find_records(self.file, self.position + 1, self.limit, channel_ids)
+            place = find_records(self.file, self.position + 1, self.limit, channel_ids)
+        other = find_recording(self.file, self.unsure, place)
+        self.go(place, is_sure=True)
+        return other
+
+
+def is_same(file: BinaryIO, first: int, second: int, length: int) -> bool:
+    """Whether the same bytes stand at two offsets of a file."""
+    for step in range(0, length, _READ_BYTES):
+        file.seek(first + step)
+        data = file.read(min(_READ_BYTES, length - step))
+        file.seek(second + step)
+        if file.read(len(data)) != data:
+            return False
+    return True

@@ -1,12 +1,8 @@
 """How sound a log is: the verdict on what a walk over it has found, in sentences for people."""
 
-from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
-from pathlib import Path
-
-from mcap.records import Statistics
 
 from pipeline.logs.plan import Loss, Plan
 
@@ -33,16 +29,23 @@ class Health:
     has_checksums: bool = True
 
 
-def health_of(plan: Plan) -> Health:
-    """The health of one file; messages of channels without definition count as lost."""
+def health_of(plans: Sequence[Plan]) -> Health:
+    """The health of one file, by the plans of the recordings that it holds."""
+    if len(plans) == 1:
+        return _health_of(plans[0])
+    named = [(f"Recording {number}, byte {plan.begin} on", _health_of(plan)) for number, plan in enumerate(plans, start=1)]
+    remark = f"The file holds {len(plans)} recordings, one behind the other: they are read as parts of one mission."
+    health = united_health(named)
+    return replace(health, problems=(remark, *health.problems))
+
+
+def _health_of(plan: Plan) -> Health:
+    """The health of one recording; messages of channels without definition count as lost."""
     counts = plan.counts()
     found = counts.total()
     lost = {number: count for number, count in counts.items() if number not in plan.channels}
     readable = found - sum(lost.values())
-    statistics = plan.summary.statistics if plan.summary else None
-    expected = statistics.message_count if statistics else None
-    if expected is None and all(loss.num_messages is not None for loss in plan.losses) and plan.reached_end and not plan.doubts:
-        expected = found + sum(loss.num_messages or 0 for loss in plan.losses)
+    expected = plan.statistics.message_count - plan.repeated.total() if plan.statistics else None
     problems = [_sentence(loss) for loss in plan.losses[:_MAX_SENTENCES]]
     if len(plan.losses) > _MAX_SENTENCES:
         problems.append(f"{len(plan.losses) - _MAX_SENTENCES} more damaged places follow.")
@@ -54,17 +57,19 @@ def health_of(plan: Plan) -> Health:
     for number, channel in sorted(plan.channels.items()):
         if channel.schema_id and channel.schema_id not in plan.schemas:
             problems.append(f"Channel {number} ({channel.topic}) names schema {channel.schema_id}, which is not in the file.")
-    disagreement = _disagreement(counts, readable, expected, statistics)
-    if disagreement:
+    if expected not in (None, readable):
         is_complete = False
-        problems.append(disagreement)
+        problems.append(f"The file should hold {expected} messages; {readable} can be read.")
+    elif expected is not None and not plan.is_counted():
+        is_complete = False
+        problems.append("The numbers of messages of single channels differ from the statistics of the file.")
     spans = tuple(sorted({loss.span_ns for loss in plan.losses if loss.span_ns is not None}))
     return Health(is_complete, (*problems, *plan.remarks), readable, expected, spans, plan.has_checksums)
 
 
-def united_health(parts: Sequence[tuple[Path, Health]], unread: Sequence[str] = ()) -> Health:
-    """The health of a recording in several files; `unread` says of each part that is lost as a whole why it is."""
-    problems = [*unread, *(f"{path.name}: {problem}" for path, health in parts for problem in health.problems)]
+def united_health(parts: Sequence[tuple[str, Health]], unread: Sequence[str] = ()) -> Health:
+    """The health of a mission in several named parts; `unread` says of each part that is lost as a whole why it is."""
+    problems = [*unread, *(f"{name}: {problem}" for name, health in parts for problem in health.problems)]
     expected = [health.num_messages_expected for _, health in parts]
     return Health(
         is_complete=not unread and all(health.is_complete for _, health in parts),
@@ -83,15 +88,6 @@ def utc(time_ns: int) -> str:
     except (ValueError, OverflowError, OSError):
         return f"{time_ns / 1e9:.3f} s"
     return f"{moment:%Y-%m-%dT%H:%M:%S}.{time_ns // 10**6 % 1000:03d}Z"
-
-
-def _disagreement(counts: Counter[int], readable: int, expected: int | None, statistics: Statistics | None) -> str:
-    """How the messages that were found differ from what the file says of itself; empty where they agree."""
-    if expected is not None and expected != readable:
-        return f"The file should hold {expected} messages; {readable} can be read."
-    if statistics is not None and statistics.channel_message_counts and +Counter(statistics.channel_message_counts) != +counts:
-        return "The numbers of messages of single channels differ from the statistics of the file."
-    return ""
 
 
 def _sentence(loss: Loss) -> str:

@@ -20,7 +20,7 @@ def plan_by_index(path: Path) -> Plan | None:
     """The plan of the file; None where its summary or message indexes are absent or incomplete."""
     try:
         with path.open("rb") as file:
-            summary, fault = read_summary(file, path.stat().st_size)
+            summary, fault = read_summary(file, 0, path.stat().st_size)
             if summary is None or fault or summary.statistics is None:
                 return None
             return _plan(file, summary, summary.statistics)
@@ -29,7 +29,7 @@ def plan_by_index(path: Path) -> Plan | None:
 
 
 def _plan(file: BinaryIO, summary: Summary, statistics: records.Statistics) -> Plan | None:
-    plan = Plan(channels=summary.channels, schemas=summary.schemas, summary=summary, reached_end=True)
+    plan = Plan(channels=summary.channels, schemas=summary.schemas, summary=summary, statistics=statistics, reached_end=True)
     plan.library = _library(file)
     for index in summary.chunks.values():
         block = _block(file, index)

@@ -42,8 +42,10 @@ class Loss:
 
 @dataclass
 class Plan:
-    """What a log holds and what it has lost; filled by `scan_log`."""
+    """What a recording holds and what it has lost; `begin` and `end` are its bytes in the file."""
 
+    begin: int = 0
+    end: int = 0
     blocks: list[Block] = field(default_factory=list)
     channels: dict[int, records.Channel] = field(default_factory=dict)
     schemas: dict[int, records.Schema] = field(default_factory=dict)
@@ -54,6 +56,10 @@ class Plan:
     doubts: list[str] = field(default_factory=list)
     """Faults by which messages may be lost or wrong, without a place in the file."""
     summary: Summary | None = None
+    statistics: records.Statistics | None = None
+    """What the file says that it holds; None where it does not, or cannot be believed."""
+    repeated: Counter[int] = field(default_factory=Counter)
+    """Messages by channel id that are not in the blocks because another recording of the file holds them, too."""
     library: str = ""
     reached_end: bool = False
     has_checksums: bool = True
@@ -64,6 +70,13 @@ class Plan:
         for block in self.blocks:
             counts.update(block.num_messages)
         return counts
+
+    def is_counted(self) -> bool:
+        """Whether the file says how many messages each channel has, and so many were found."""
+        stated, found = self.statistics, self.counts() + self.repeated
+        if stated is None or stated.message_count != found.total():
+            return False
+        return not stated.channel_message_counts or +Counter(stated.channel_message_counts) == found
 
 
 @dataclass

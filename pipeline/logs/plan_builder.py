@@ -1,11 +1,13 @@
 """The plan of a log in the making: what a walk meets is taken record by record, each as a whole or not at all."""
 
 from dataclasses import dataclass, field
+from typing import Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 from mcap.opcode import Opcode
 
+from pipeline.logs.file_walk import FileWalk
 from pipeline.logs.plan import Block, LooseRun, Loss, Plan, is_span
 from pipeline.logs.records import (
     HEAD,
@@ -18,11 +20,20 @@ from pipeline.logs.records import (
     unpack_chunk,
     unpack_cut_chunk,
 )
-from pipeline.logs.rows import Definitions, Index, Rows, agrees, rows_at, rows_by_index, rows_by_walk
+from pipeline.logs.rows import Definitions, Rows, agrees, rows_at, rows_by_index, rows_by_walk
 from pipeline.logs.summary import Summary
 
-LOOSE_BLOCK_BYTES = 2**20
+LOOSE_BLOCK_BYTES: Final = 2**20
 """Messages outside chunks are planned in stretches of about this size."""
+
+
+class ChunkFacts(NamedTuple):
+    """By what a chunk is known again: an index states the same but for the checksum. `length` is that of the record."""
+
+    length: int
+    start_ns: int
+    end_ns: int
+    crc: int
 
 
 @dataclass
@@ -32,13 +43,17 @@ class Tally:
     num_unknown      records of kinds that are not known
     num_timeless     messages whose log times do not fit into int64
     num_bad_indexes  chunks with a checksum that differ from their message indexes
+    num_attachments
     definitions      opcode and body of every channel and schema
+    chunks           every chunk by its offset, as its head states it
     """
 
     num_unknown: int = 0
     num_timeless: int = 0
     num_bad_indexes: int = 0
+    num_attachments: int = 0
     definitions: set[bytes] = field(default_factory=set)
+    chunks: dict[int, ChunkFacts] = field(default_factory=dict)
 
 
 class PlanBuilder:
@@ -48,22 +63,30 @@ class PlanBuilder:
     were found in it where nothing has confirmed them (`_unchecked`).
     """
 
-    def __init__(self, summary: Summary | None) -> None:
+    def __init__(self, walk: FileWalk, summary: Summary | None) -> None:
+        self._walk = walk
         self.plan = Plan(summary=summary)
         self.tally = Tally()
         self._loose = LooseRun()
         self._broken: int | None = None
         self._unchecked: Rows | None = None
 
+    @property
+    def is_broken(self) -> bool:
+        """Whether what came last was a chunk that could not be used."""
+        return self._broken is not None
+
     def forget_chunk(self) -> None:
         """What follows is no message index of the chunk before."""
         self._broken = self._unchecked = None
 
-    def add_chunk(self, offset: int, length: int, chunk: PackedChunk, index: tuple[Index, int]) -> None:
-        """Take a chunk, whose body is these bytes of the file, and the indexes behind it, with their length in bytes."""
+    def add_chunk(self, offset: int, length: int, chunk: PackedChunk) -> None:
+        """Take a chunk, whose body is these bytes of the file, with the message indexes behind it."""
         self.plan.has_checksums = self.plan.has_checksums and chunk.crc != 0
+        facts = ChunkFacts(HEAD.size + length, chunk.start_ns, chunk.end_ns, chunk.crc)
+        self.tally.chunks[offset - HEAD.size] = facts
         try:
-            block = self._block(offset, length, unpack_chunk(chunk), index, has_checksum=chunk.crc != 0)
+            block = self._block(offset, length, unpack_chunk(chunk), has_checksum=chunk.crc != 0)
         except DamagedRecord as error:
             span = (chunk.start_ns, chunk.end_ns) if is_span(chunk.start_ns, chunk.end_ns) else None
             self.add_loss(offset - HEAD.size, str(error), span, is_chunk=True)
@@ -139,9 +162,9 @@ class PlanBuilder:
         if run.begin >= 0:
             self.plan.blocks.append(run.block())
 
-    def _block(self, offset: int, length: int, data: bytes, index: tuple[Index, int], has_checksum: bool) -> Block:
+    def _block(self, offset: int, length: int, data: bytes, has_checksum: bool) -> Block:
         """The block of a chunk: planned by the indexes behind it where they agree with it, else by a walk through it."""
-        entries, index_length = index
+        entries, index_length = self._walk.index_behind(offset + length)
         found = rows_by_index(data, entries) if index_length else None
         if found is None:
             found = rows_by_walk(data)

@@ -1,12 +1,11 @@
 """Mission logs: what an MCAP holds, how sound it is, and its messages in log-time order, in bounded memory.
 
-`open_log` checks the whole file once (see `salvage`), so the health of a log is known before the first message is used;
+`open_log` checks the whole file once (see `recordings`), so the health of a log is known before the first message is used;
 `open_parts` makes one mission of a recording in several files; `reopen` trusts the index of what was checked before.
 """
 
-from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from cadence.errors import InputError
@@ -19,9 +18,10 @@ from pipeline.logs.health import utc as utc
 from pipeline.logs.indexed import plan_by_index
 from pipeline.logs.parts import missing_parts, mission_name
 from pipeline.logs.plan import Plan
+from pipeline.logs.recordings import scan_log
 from pipeline.logs.records import MAGIC, MAX_TIME_NS, TEXT_MAGIC, parse_metadata
-from pipeline.logs.salvage import scan_log
 from pipeline.logs.timeline import Selection, Source, Timeline, read_span, reading
+from pipeline.logs.uniting import unite
 
 OnBytes = Callable[[int], object]
 _FOREIGN_MAGIC = {
@@ -56,7 +56,7 @@ class MissionLog:
     @property
     def parts(self) -> tuple[Path, ...]:
         """The files of the mission that can be read, in their order."""
-        return tuple(source.path for source in self._sources)
+        return tuple(dict.fromkeys(source.path for source in self._sources))
 
     @property
     def name(self) -> str:
@@ -120,12 +120,8 @@ def open_log(path: Path | str, on_bytes: OnBytes | None = None) -> MissionLog:
     `on_bytes` is called as in `MissionLog.messages`. Raises `InputError` where there is no MCAP at `path`.
     """
     path = Path(path)
-    size = _check_magic(path)
-    try:
-        plan = scan_log(path, size, on_bytes)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); check the disk") from error
-    return _log_of(path, size, plan, health_of(plan))
+    sources, health, library = _checked(path, on_bytes)
+    return _log_of(path, sources, health, library)
 
 
 def open_parts(paths: Sequence[Path], on_bytes: OnBytes | None = None) -> MissionLog:
@@ -134,22 +130,24 @@ def open_parts(paths: Sequence[Path], on_bytes: OnBytes | None = None) -> Missio
     A part that is no log (recorders leave empty ones behind) and a part that `metadata.yaml` names but that is not there
     are named by the health as lost. Raises `InputError` where one of `paths` does not exist, or none of them is a log.
     """
-    logs, unread = (
-        [],
-        [f"{path.name}: is named in {path.parent / 'metadata.yaml'}, but not there." for path in missing_parts(paths)],
-    )
+    unread = [f"{path.name}: is named in {path.parent / 'metadata.yaml'}, but not there." for path in missing_parts(paths)]
     if not paths:
         raise InputError("a mission without parts; name at least one file")
+    found: dict[Path, tuple[list[Source], Health, str]] = {}
     for path in paths:
         try:
-            logs.append(open_log(path, on_bytes))
+            found[path] = _checked(path, on_bytes)
         except InputError as error:
-            if not path.is_file() or (path == paths[-1] and not logs):
+            if not path.is_file() or (path == paths[-1] and not found):
                 raise
             unread.append(f"{error}.")
             if on_bytes is not None:
                 on_bytes(path.stat().st_size)
-    return logs[0] if len(logs) == 1 and not unread else _united(logs, unread)
+    sources = [source for each, _, _ in found.values() for source in each]
+    first, (_, health, library) = next(iter(found.items()))
+    if len(found) > 1 or unread:
+        health = united_health([(path.name, health) for path, (_, health, _) in found.items()], unread)
+    return _log_of(first, sources, health, library)
 
 
 def reopen(paths: Sequence[Path], health: Health, on_bytes: OnBytes | None = None) -> MissionLog:
@@ -158,57 +156,40 @@ def reopen(paths: Sequence[Path], health: Health, on_bytes: OnBytes | None = Non
     Sound files are planned by their indexes alone, without unpacking a chunk; others are checked again.
     """
     if not health.problems:
-        plans = [plan_by_index(path) for path in paths]
-        if sum(plan.counts().total() for plan in plans if plan is not None) == health.num_messages and None not in plans:
-            found = [(path, plan) for path, plan in zip(paths, plans, strict=True) if plan is not None]
-            logs = [_log_of(path, path.stat().st_size, plan, replace(health, num_messages=0)) for path, plan in found]
-            return replace(logs[0] if len(logs) == 1 else _united(logs, ()), health=health)
+        plans = [plan for plan in map(plan_by_index, paths) if plan is not None]
+        if len(plans) == len(paths) and sum(plan.counts().total() for plan in plans) == health.num_messages:
+            sources = [_source_of(path, plan, path.stat().st_size) for path, plan in zip(paths, plans, strict=True)]
+            return _log_of(paths[0], sources, health, plans[0].library)
     return open_parts(paths, on_bytes)
 
 
-def _log_of(path: Path, size: int, plan: Plan, health: Health) -> MissionLog:
-    channels = _channels(plan)
-    known = {channel.id: channel for channel in channels}
-    blocks = tuple(block for block in plan.blocks if known.keys() & block.num_messages.keys())
+def _checked(path: Path, on_bytes: OnBytes | None) -> tuple[list[Source], Health, str]:
+    """The recordings in a file, every checksum checked, its health, and who wrote it."""
+    size = _check_magic(path)
+    try:
+        plans = scan_log(path, size, on_bytes)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); check the disk") from error
+    ends = [*(plan.begin for plan in plans[1:]), size]
+    sources = [_source_of(path, plan, end - plan.begin) for plan, end in zip(plans, ends, strict=True)]
+    return sources, health_of(plans), plans[0].library
+
+
+def _source_of(path: Path, plan: Plan, size_bytes: int) -> Source:
+    channels = {channel.id: channel for channel in _channels(plan)}
+    blocks = tuple(block for block in plan.blocks if channels.keys() & block.num_messages.keys())
+    return Source(path, size_bytes, blocks, channels, tuple(plan.metadata_spans))
+
+
+def _log_of(path: Path, sources: Sequence[Source], health: Health, library: str) -> MissionLog:
+    united, channels = unite(sources)
+    blocks = [block for source in united for block in source.blocks]
     return MissionLog(
-        path, size, channels,
+        path, sum(source.size_bytes for source in united), channels,
         start_ns=min((block.start_ns for block in blocks), default=0),
         end_ns=max((block.end_ns for block in blocks), default=0),
-        health=health, library=plan.library,
-        _sources=(Source(path, size, blocks, known, tuple(plan.metadata_spans)),),
+        health=health, library=library, _sources=united,
     )  # fmt: skip
-
-
-def _united(logs: Sequence[MissionLog], unread: Sequence[str]) -> MissionLog:
-    channels: dict[tuple[object, ...], Channel] = {}
-    sources = []
-    for log in logs:
-        (source,) = log._sources
-        repeated: Counter[tuple[object, ...]] = Counter()
-        ids: dict[int, tuple[object, ...]] = {}
-        for number, channel in source.channels.items():
-            key = (channel.topic, channel.message_encoding, channel.schema_name, channel.schema_encoding, channel.schema_data)
-            repeated[key] += 1  # a file may have several channels of one topic and schema; they stay apart
-            ids[number] = (*key, repeated[key])
-            channels[ids[number]] = _joined(channels.get(ids[number]), channel, {other.id for other in channels.values()})
-        sources.append((source, ids))
-    full = [log for log in logs if log._sources[0].blocks]
-    return MissionLog(
-        logs[0].path, sum(log.size_bytes for log in logs), tuple(sorted(channels.values(), key=lambda channel: channel.id)),
-        start_ns=min((log.start_ns for log in full), default=0),
-        end_ns=max((log.end_ns for log in full), default=0),
-        health=united_health([(log.path, log.health) for log in logs], unread), library=logs[0].library,
-        _sources=tuple(
-            replace(source, channels={number: channels[key] for number, key in ids.items()}) for source, ids in sources
-        ),
-    )  # fmt: skip
-
-
-def _joined(earlier: Channel | None, channel: Channel, taken: Collection[int]) -> Channel:
-    """The channel of the mission to which one more file adds its messages; its id is one that no other channel has."""
-    if earlier is None:
-        return replace(channel, id=max(taken) + 1) if channel.id in taken else channel
-    return replace(earlier, message_count=(earlier.message_count or 0) + (channel.message_count or 0))
 
 
 def _check_magic(path: Path) -> int:

@@ -78,11 +78,17 @@ class StrictStream(ReadDataStream):
         return data
 
 
+def parse_header(body: bytes) -> records.Header:
+    """The Header record with this body; `DamagedRecord` where it is none."""
+    with damage():
+        record: records.Header = records.Header.read(StrictStream(body))
+    return record
+
+
 def library_of(body: bytes) -> str:
     """Who wrote the file, from the body of its Header record; empty where that cannot be read."""
     try:
-        with damage():
-            return str(records.Header.read(StrictStream(body)).library)
+        return str(parse_header(body).library)
     except DamagedRecord:
         return ""
 

@@ -1,8 +1,9 @@
-"""Where records begin again after damage, in a file whose index does not tell."""
+"""Where records begin again after damage, in a file whose index does not tell, and where another recording begins."""
 
 import re
 import struct
 from collections.abc import Callable, Collection, Mapping
+from functools import partial
 from typing import BinaryIO, Final
 
 from mcap.opcode import Opcode
@@ -11,22 +12,29 @@ from pipeline.logs.records import (
     CHUNK_HEAD,
     CHUNK_HEAD_BYTES,
     HEAD,
+    MAGIC,
     MESSAGE_HEAD,
     DamagedRecord,
     is_chunk_head,
     parse_channel,
+    parse_header,
     parse_metadata,
     parse_schema,
 )
+from pipeline.logs.summary import SUMMARY_OPCODES, parse_summary_record
 
 _WINDOW_BYTES: Final = 2**20
 _MAX_SEARCH_BYTES: Final = 2**28
 _BELIEVED: Final = 3  # points that make a place believable, see `_points`
 _CANDIDATE: Final = re.compile(rb"[\x01-\x0f](?=[\x00-\xff]{5}\x00{3})")  # an opcode and a length below 2**40
+_BEGINNING: Final = re.compile(re.escape(MAGIC) + rb"\x01[\x00-\xff]{2}\x00{6}")  # magic and the head of a small header
+_BEGINNING_BYTES: Final = len(MAGIC) + HEAD.size
+_MAX_HEADER_BYTES: Final = 2**16
 _PARSERS: Final[Mapping[int, Callable[[bytes], object]]] = {
     Opcode.CHANNEL: parse_channel,
     Opcode.SCHEMA: parse_schema,
     Opcode.METADATA: parse_metadata,
+    **{opcode: partial(parse_summary_record, opcode) for opcode in SUMMARY_OPCODES},
 }
 
 
@@ -41,6 +49,32 @@ def find_records(file: BinaryIO, begin: int, limit: int, channel_ids: Collection
             if offset + HEAD.size + length <= limit and _is_believable(file, offset, limit, channel_ids):
                 return offset
     return limit
+
+
+def begins_recording(file: BinaryIO, offset: int, limit: int) -> bool:
+    """Whether a recording begins at `offset`: magic, and a header whose lengths agree with each other."""
+    file.seek(offset)
+    start = file.read(len(MAGIC) + HEAD.size)
+    if start[: len(MAGIC)] != MAGIC or len(start) < len(MAGIC) + HEAD.size:
+        return False
+    opcode, length = HEAD.unpack_from(start, len(MAGIC))
+    if opcode != Opcode.HEADER or length > _MAX_HEADER_BYTES or offset + len(start) + length > limit:
+        return False
+    try:
+        parse_header(file.read(length))
+    except DamagedRecord:
+        return False
+    return True
+
+
+def find_recording(file: BinaryIO, begin: int, end: int) -> int | None:
+    """The first place in these bytes of the file at which a recording begins."""
+    for window in range(begin, end, _WINDOW_BYTES):
+        file.seek(window)
+        for match in _BEGINNING.finditer(file.read(min(_WINDOW_BYTES + _BEGINNING_BYTES - 1, end - window))):
+            if begins_recording(file, window + match.start(), end):
+                return window + match.start()
+    return None
 
 
 def _is_believable(file: BinaryIO, offset: int, limit: int, channel_ids: Collection[int]) -> bool:

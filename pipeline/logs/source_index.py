@@ -38,6 +38,9 @@ _MAX_NAMES_BYTES: Final = 2**20  # times, name and media type of an attachment
 _IN_SUMMARY: Final = frozenset(
     {Opcode.SCHEMA, Opcode.CHANNEL, Opcode.CHUNK_INDEX, Opcode.ATTACHMENT_INDEX, Opcode.METADATA_INDEX}
 )
+_IN_DATA: Final = frozenset(
+    {Opcode.MESSAGE, Opcode.CHUNK, Opcode.MESSAGE_INDEX, Opcode.ATTACHMENT, Opcode.METADATA, Opcode.DATA_END}
+)
 
 
 @dataclass
@@ -74,7 +77,8 @@ def read_index(file: BinaryIO, size: int) -> SourceIndex:
     if _read(file, 0, min(size, len(MAGIC))) != MAGIC:
         raise DamagedRecord("it does not begin as an MCAP file does")
     survey = _survey(file, size)
-    summary, _ = read_summary(file, size)
+    _check_tail(file, survey.data_end + HEAD.size + 4, size)
+    summary, _ = read_summary(file, 0, size)
     index = _from_summary(file, size, survey, summary) if summary is not None else None
     if index is None:
         index = _from_data(file, size)
@@ -94,6 +98,18 @@ def _heads(file: BinaryIO, size: int) -> Iterator[tuple[int, int, int]]:
         if position + HEAD.size + length > size:
             raise DamagedRecord("the file ends inside a record")
         yield position, opcode, length
+        position += HEAD.size + length
+
+
+def _check_tail(file: BinaryIO, position: int, size: int) -> None:
+    """Raise where behind the end of the data stands more than a summary, as far as that can be read."""
+    opcode = 0
+    while position + HEAD.size <= size:
+        if opcode == Opcode.FOOTER:
+            raise DamagedRecord(f"at byte {position}: more follows behind its end")
+        opcode, length = HEAD.unpack(_read(file, position, HEAD.size))
+        if opcode in _IN_DATA:
+            raise DamagedRecord(f"at byte {position}: records of the data follow behind their end")
         position += HEAD.size + length
 
 

@@ -42,7 +42,11 @@ class Selection:
 
 @dataclass(frozen=True)
 class Source:
-    """One file of a mission, as it was planned. `channels` are those of the mission by the ids that the file uses."""
+    """One recording of a mission, as it was planned: a file, or a part of one that holds several.
+
+    size_bytes  of its part of the file
+    channels    those of the mission by the ids that the recording uses
+    """
 
     path: Path
     size_bytes: int

@@ -102,7 +102,7 @@ def assert_combined(target, source, side, twin=None):
 
 def statistics(path):
     with path.open("rb") as file:
-        summary, fault = read_summary(file, path.stat().st_size)
+        summary, fault = read_summary(file, 0, path.stat().st_size)
     assert not fault
     return summary.statistics
 
@@ -376,3 +376,23 @@ def test_recorded_logs(shared_data, tmp_path, name):
         shared_data / "formats" / f"{name}.mcap",
         tmp_path / "side.mcap",
     )
+
+
+@pytest.mark.parametrize("kind", ["two recordings", "end mark among the data", "bytes behind the end"])
+def test_more_than_one_recording_is_not_combined(kind, tmp_path):
+    """The combined file would hold what stands before the first end mark only."""
+    path = source_log(tmp_path / "log.mcap")
+    data = path.read_bytes()
+    records = list(walk(data[len(MAGIC) : -len(MAGIC)]))
+    chunk = next(begin for opcode, begin, _ in records if opcode == Opcode.CHUNK) + len(MAGIC) - HEAD.size
+    mark = next((begin, end) for opcode, begin, end in records if opcode == Opcode.DATA_END)
+    end_mark = data[len(MAGIC) + mark[0] - HEAD.size : len(MAGIC) + mark[1]]
+    damaged = {
+        "two recordings": data + data,
+        "end mark among the data": data[:chunk] + end_mark + data[chunk:],
+        "bytes behind the end": data + bytes(20),
+    }
+    path.write_bytes(damaged[kind])
+    with pytest.raises(InputError, match="behind"):
+        write_combined(path, side_log(tmp_path / "side.mcap"), tmp_path / "combined.mcap", Packing(), QUIET)
+    assert not (tmp_path / "combined.mcap").exists()
