@@ -20,6 +20,7 @@ from cadence.errors import ConfigError, DeviceError
 from pipeline.config import config_as_dict, read_config
 from pipeline.documents import parse_json
 from pipeline.files import hash_file, replacing, write_atomic
+from pipeline.suggestions import did_you_mean
 
 Network = TypeVar("Network", bound=nn.Module)
 
@@ -59,8 +60,11 @@ def find_checkpoint(name: str) -> Path:
     shipped = Path(cadence.__file__).parent / "checkpoints"
     path = Path(name) if name.endswith(".safetensors") else shipped / f"{name}.safetensors"
     if not path.is_file():
-        known = ", ".join(sorted(p.stem for p in shipped.glob("*.safetensors"))) or "none"
-        raise ConfigError(f"checkpoint {name!r}: not found; give a .safetensors file or a shipped name ({known})")
+        known = sorted(p.stem for p in shipped.glob("*.safetensors"))
+        raise ConfigError(
+            f"checkpoint {name!r}: not found{did_you_mean(name, known)}; give a .safetensors file or a shipped name "
+            f"({', '.join(known) or 'none'})"
+        )
     return path
 
 

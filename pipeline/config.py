@@ -14,6 +14,7 @@ from typing import Any, TypeVar
 
 from cadence.errors import ConfigError
 from pipeline.documents import parse_toml
+from pipeline.suggestions import did_you_mean
 
 T = TypeVar("T")
 
@@ -40,7 +41,7 @@ def load_tables(path: Path | None, overrides: Sequence[str] = ()) -> dict[str, d
     where = str(path) if path is not None else "--set"
     for name, table in tables.items():
         if name not in TABLES:
-            raise ConfigError(f"{where}: unknown table {name!r}; known tables: {', '.join(TABLES)}")
+            raise ConfigError(f"{where}: unknown table {name!r}{did_you_mean(name, TABLES)}; known tables: {', '.join(TABLES)}")
         if not isinstance(table, Mapping):
             raise ConfigError(f"{where}: {name!r} is a table, not a value; write {name}.KEY = {table!r} with one of its keys")
     return tables
@@ -108,10 +109,11 @@ def merge_overrides(tables: Mapping[str, Any], overrides: Sequence[str]) -> dict
 def read_config(cls: type[T], tables: Mapping[str, Any], where: str = "config") -> T:
     """An instance of the frozen dataclass `cls` from TOML tables; missing keys take their defaults."""
     fields = {field.name: field for field in dataclasses.fields(cls)}  # type: ignore[arg-type]
+    hints = typing.get_type_hints(cls)
     unknown = [key for key in tables if key not in fields]
     if unknown:
-        raise ConfigError(f"{where}: unknown key {unknown[0]!r}; known keys: {', '.join(fields)}")
-    hints = typing.get_type_hints(cls)
+        meant = did_you_mean(unknown[0], fields) or _elsewhere(hints, unknown[0])
+        raise ConfigError(f"{where}: unknown key {unknown[0]!r}{meant}; known keys: {', '.join(fields)}")
     values = {key: _convert(hints[key], value, f"{where}.{key}".lstrip(".")) for key, value in tables.items()}
     missing = [
         name
@@ -141,6 +143,13 @@ def _changed(config: Mapping[str, Any], default: Mapping[str, Any]) -> list[str]
     return found
 
 
+def _elsewhere(hints: Mapping[str, Any], key: str) -> str:
+    """Which of the tables inside has a key of this name; empty where none has."""
+    tables = [name for name, hint in hints.items() if dataclasses.is_dataclass(hint)]
+    found = [f"{name}.{key}" for name in tables if key in {field.name for field in dataclasses.fields(hints[name])}]
+    return f" (did you mean {found[0]!r}?)" if found else ""
+
+
 def config_as_dict(config: object) -> dict[str, Any]:
     """The resolved configuration as plain JSON-able values, for manifests."""
     return typing.cast(dict[str, Any], _plain(dataclasses.asdict(config)))  # type: ignore[call-overload]
@@ -163,7 +172,9 @@ def _convert(hint: Any, value: Any, where: str) -> Any:
     if origin is typing.Literal:
         if value in arguments:
             return value
-        raise ConfigError(f"{where}: {_brief(value)} is not one of {', '.join(map(str, arguments))}")
+        raise ConfigError(
+            f"{where}: {_brief(value)} is not one of {', '.join(map(str, arguments))}{did_you_mean(str(value), map(str, arguments))}"
+        )
     if dataclasses.is_dataclass(hint):
         if isinstance(value, Mapping):
             return read_config(typing.cast(type[Any], hint), value, where)

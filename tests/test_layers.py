@@ -24,7 +24,7 @@ SOURCES = sorted(
 # Inside a layer, from the ground up: what stands on a floor may import what stands below it, and nothing beside it.
 FLOORS = {
     "pipeline": (
-        {"documents", "out_of_memory"},
+        {"documents", "out_of_memory", "suggestions"},
         {"arrays", "config", "locks", "progress", "provenance", "plain_rows", "obstacle_file"},
         {"files"},
         {"manifest", "tables"},

@@ -9,6 +9,7 @@ from pipeline.extract.thinning import ThinningConfig
 from pipeline.logs.reader import Channel
 from pipeline.mapping.guess import SuggestedMapping, dense_sources, describe_channels, suggest_mapping, usable_preset
 from pipeline.mapping.sources import SourceConfig
+from pipeline.suggestions import by_likeness, did_you_mean
 
 ROLES = ("detections", "truth", "poses")
 _OTHER_ROLES = ("truth", "poses", "tf", "obstacles")
@@ -26,7 +27,7 @@ def selected_channels(channels: Sequence[Channel], patterns: Sequence[str]) -> t
     """
     for pattern in patterns:
         if not any(fnmatch.fnmatchcase(channel.topic, pattern) for channel in channels):
-            raise ConfigError(f"extract.topics: no topic of the log fits {pattern!r}; topics: {describe_channels(channels)}")
+            raise ConfigError(f"extract.topics: no topic of the log fits {pattern!r}{_meant(pattern, channels)}")
     return tuple(c for c in channels if not patterns or any(fnmatch.fnmatchcase(c.topic, pattern) for pattern in patterns))
 
 
@@ -110,7 +111,7 @@ def _readers(
     named = [(channel, found) for channel in channels if (found := source.match(channel.topic)) is not None]
     if not named:
         raise ConfigError(
-            f"extract.{role}: no topic of the log is {source.topic!r}; topics: {describe_channels(channels)}; correct the entry"
+            f"extract.{role}: no topic of the log is {source.topic!r}{_meant(source.topic, channels)}; correct the entry"
         )
     return [
         ChannelReader(channel, source, role, is_stated, found)
@@ -130,6 +131,13 @@ def _is_left_out(
     own = usable_preset(channel)
     is_for_others = any(usable_preset(other) == source.preset and source.match(other.topic) is not None for other in channels)
     return not is_stated or is_for_others or any(s.preset == own and s.match(channel.topic) is not None for s in sources)
+
+
+def _meant(topic: str, channels: Sequence[Channel]) -> str:
+    """Which topic may have been meant, and what there is, the likeliest first."""
+    by_topic = {channel.topic: channel for channel in channels}
+    likely = [by_topic[name] for name in by_likeness(topic, by_topic)]
+    return f"{did_you_mean(topic, by_topic)}; topics: {describe_channels(likely)}"
 
 
 def _named(suggested: SuggestedMapping, channels: Sequence[Channel]) -> list[Channel]:
@@ -152,10 +160,17 @@ def _no_detections(suggested: SuggestedMapping, channels: Sequence[Channel]) -> 
     if unread:
         paths = 'add [[extract.detections]] with topic, x = "path", y = "path" (or latitude, longitude)'
         return f"no preset knows the schema of {', '.join(unread)}; {paths}; cadence info LOG prints the lines"
-    dense = [source.topic for source in (*suggested.truth, *dense_sources(channels, suggested))]
-    if not dense:
-        advice = 'add [[extract.detections]] with topic = "/...", x = "path", y = "path" (or latitude, longitude)'
+    return f"nothing looks like detections among {describe_channels(channels)}; {_advice(suggested, channels)}"
+
+
+def _advice(suggested: SuggestedMapping, channels: Sequence[Channel]) -> str:
+    """What to write where nothing looks like detections; never to take the truth, or where a sensor was, for them."""
+    dense = () if suggested.truth else dense_sources(channels, suggested)
+    if dense:
+        entry = f'if it tells where targets are, add [[extract.detections]] with topic = "{dense[0].topic}"'
+        entry += ", or make sparse detections of a dense channel with --set extract.thinning.enabled=true"
     else:
-        entry = f'add [[extract.detections]] with topic = "{dense[0]}"'
-        advice = f"{entry}, or make sparse detections of a dense channel with --set extract.thinning.enabled=true"
-    return f"nothing looks like detections among {describe_channels(channels)}; {advice}; cadence info LOG prints the lines"
+        entry = (
+            'if one holds them, add [[extract.detections]] with topic = "/...", x = "path", y = "path" (or latitude, longitude)'
+        )
+    return f"{entry}; cadence info LOG prints the lines"

@@ -51,7 +51,7 @@ def test_values_reach_their_fields_with_their_types():
     ("tables", "says"),
     [
         ({}, "key 'name' is missing"),
-        ({"name": "n", "cuont": 1}, "unknown key 'cuont'; known keys: name, count, is_on"),
+        ({"name": "n", "cuont": 1}, r"unknown key 'cuont' \(did you mean 'count'\?\); known keys: name, count, is_on"),
         ({"name": 1}, r"config\.name: expected str, got 1"),
         ({"name": "n", "count": 1.5}, r"config\.count: expected int, got 1\.5"),
         ({"name": "n", "count": True}, r"config\.count: expected int, got True"),
@@ -109,7 +109,9 @@ def test_override_below_a_value_is_refused():
 def test_file_with_unknown_table_names_the_known_ones(tmp_path):
     path = tmp_path / "c.toml"
     path.write_text("[infre]\nx = 1\n")
-    with pytest.raises(ConfigError, match=r"c\.toml: unknown table 'infre'; known tables: ingest, extract"):
+    with pytest.raises(
+        ConfigError, match=r"c\.toml: unknown table 'infre' \(did you mean 'infer'\?\); known tables: ingest, extract"
+    ):
         load_tables(path)
 
 
@@ -143,3 +145,10 @@ def test_nesting_without_end_is_one_short_line(tmp_path):
     with pytest.raises(ConfigError) as caught:
         read_config(Outer, {"name": "n", "count": parse_override("count=" + "[" * 20_000)[1]})
     assert len(str(caught.value)) < 200
+
+
+def test_what_was_meant_is_said_also_where_it_stands_in_a_table_inside():
+    with pytest.raises(ConfigError, match=r"unknown key 'ratio' \(did you mean 'inner\.ratio'\?\); known keys: name"):
+        read_config(Outer, {"name": "n", "ratio": 1})
+    with pytest.raises(ConfigError, match=r"unknown key 'zzz'; known keys: name"):
+        read_config(Outer, {"name": "n", "zzz": 1})

@@ -315,11 +315,26 @@ def test_arrays_without_detections_are_no_fault(tmp_path: Path) -> None:
 def test_nothing_to_detect(tmp_path: Path) -> None:
     match = r'nothing looks like detections among /cub1/pose .*topic = "/\{agent\}/pose", or make sparse .*cadence info'
     fails(mk(tmp_path / "a"), DENSE, InputError, match)
-    fails(
-        mk(tmp_path / "b"), [Row("/imu", "sensor_msgs/Imu", 1.0, {})], InputError, r"/imu \(sensor_msgs/Imu\); add \[\[extract"
-    )
+    match = r"/imu \(sensor_msgs/Imu\); if one holds them, add \[\[extract\.detections"
+    fails(mk(tmp_path / "b"), [Row("/imu", "sensor_msgs/Imu", 1.0, {})], InputError, match)
     assert "no message was recorded" in _no_detections(suggest_mapping([EMPTY]), [EMPTY])
     fails(mk(tmp_path / "c"), [Row("/detections", "my.Own", 1.0, {})], InputError, "no preset knows the schema of /detections")
+
+
+def test_truth_is_never_advised_as_detections(tmp_path: Path) -> None:
+    rows = [dataclasses.replace(row, topic="/truth/boat") for row in DENSE]
+    with pytest.raises(NothingDetectedError, match="nothing looks like detections among /truth/boat") as caught:
+        run(mk(tmp_path / "a"), rows)
+    advice = str(caught.value).partition("; ")[2]
+    assert "truth" not in advice and "thinning" not in advice and "[[extract.detections]]" in advice
+
+
+def test_the_topic_that_was_meant_comes_first(tmp_path: Path) -> None:
+    others = [Row(f"/a/{number}", "sensor_msgs/Imu", 1.0, {}) for number in range(12)]
+    match = r"no topic of the log is '/detection' \(did you mean '/detections'\?\); topics: /detections \("
+    fails(mk(tmp_path / "a"), others + line(), ConfigError, match, detections=[{"topic": "/detection"}])
+    match = r"no topic of the log fits '/detektions\*' \(did you mean '/detections'\?\); topics: /detections \("
+    fails(mk(tmp_path / "b"), others + line(), ConfigError, match, topics=["/detektions*"])
 
 
 def test_wrong_configuration(tmp_path: Path) -> None:
