@@ -172,9 +172,8 @@ def _convert(hint: Any, value: Any, where: str) -> Any:
     if origin is typing.Literal:
         if value in arguments:
             return value
-        raise ConfigError(
-            f"{where}: {_brief(value)} is not one of {', '.join(map(str, arguments))}{did_you_mean(str(value), map(str, arguments))}"
-        )
+        known = list(map(str, arguments))
+        raise ConfigError(f"{where}: {_brief(value)} is not one of {', '.join(known)}{did_you_mean(str(value), known)}")
     if dataclasses.is_dataclass(hint):
         if isinstance(value, Mapping):
             return read_config(typing.cast(type[Any], hint), value, where)
