@@ -51,8 +51,9 @@ fix: $(STAMP)  ## Let ruff mend what it can, and format.
 docs: $(STAMP)  ## Write docs/cli.md and docs/configuration.md from the code.
 	$(BIN)/python docs/generate.py
 
-bench: $(STAMP)  ## Run every benchmark script; each prints its own table.
-	@for script in benchmarks/*.py; do echo "== $$script"; $(BIN)/python $$script || exit 1; done
+bench: $(STAMP)  ## Run every benchmark script; each prints its section of a page.
+	@for name in $$($(BIN)/python -c 'from benchmarks.publishing import PAGES; print(*sum(PAGES.values(), ()))'); do \
+		echo "== $$name"; $(BIN)/python -m benchmarks.$$name || exit 1; done
 
 clean:  ## Remove what was built and written here; keeps .venv.
 	rm -rf build dist out *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis

@@ -7,7 +7,7 @@ settings are searched on other episodes, or on a part of the log that is not sco
 on the ships `cadence run` stands beside them, of which each moment is read from a window that ends two to four minutes later.
 Files in the work folder keep what was done: a killed run goes on where it was.
 
-    python benchmarks/association.py --publish docs/benchmarks
+    python -m benchmarks.association --publish docs
 """
 
 import argparse
@@ -22,11 +22,13 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from association_logs import SHIPS, Estimate, Log, rendezvous_logs, ship_log
-from association_scores import calibration, scores_of, told
-from association_trackers import KINDS, NUM_SAMPLES, Settings, searched, tracked
 from scipy.optimize import linear_sum_assignment
 
+from benchmarks import publishing
+from benchmarks.association_logs import SHIPS, Estimate, Log, rendezvous_logs, ship_log
+from benchmarks.association_scores import calibration, scores_of, told
+from benchmarks.association_trackers import KINDS, NUM_SAMPLES, Settings, searched, tracked
+from benchmarks.publishing import Measurement
 from cadence.arrays import Float64s, Int64s
 from cadence.association.associate import associate
 from cadence.association.types import CLUTTER, AssociationConfig, agent_probability
@@ -217,8 +219,8 @@ class Rival:
         return {f"{self.kind} + RTS (Stone Soup)": tracked(self.kind, self.settings, log)}
 
 
-def table(case: Case, jobs: int, further: dict[str, Estimator]) -> list[str]:
-    """The section of one case, with further estimators by the folder of their scores."""
+def tables(case: Case, jobs: int, further: dict[str, Estimator]) -> dict[str, list[publishing.Row]]:
+    """All numbers of one case, with further estimators by the folder of their scores."""
     folder = WORK / case.name
     with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
         settings = dict(zip(KINDS, pool.map(searched_for, [(kind, case) for kind in KINDS]), strict=True))
@@ -237,26 +239,34 @@ def table(case: Case, jobs: int, further: dict[str, Estimator]) -> list[str]:
             results.setdefault(name, []).append({key: np.array(value, dtype=float) for key, value in row.items()})
     with_tracks = [rows for rows in results.values() if all(np.isfinite(row["energy"]).any() for row in rows)]
     common = [np.all([np.isfinite(rows[index]["energy"]) for rows in with_tracks], axis=0) for index in range(len(case.logs))]
-    lines = [ROW_HEAD, *(_row(name, rows, common) for name, rows in results.items())]
-    chosen = "; ".join(f"{kind}: {setting}" for kind, setting in settings.items())
-    share = 100.0 * np.mean([cells.mean() for cells in common])
     told_of = [row for rows in results.values() for row in rows if "said" in row]
     said, came = (np.concatenate([row[key] for row in told_of]) for key in ("said", "came"))
-    lines += ["", f"Settings that the search chose: {chosen}. Energy scores are over {share:.0f} % of all cells.", ""]
-    return [*lines, CALIBRATION_HEAD, *calibration(said, came)]
+    of = {"case": case.name}
+    cells_percent = 100.0 * np.mean([cells.mean() for cells in common])
+    facts = {"num_logs": len(case.logs), "cutoff_m": case.logs[0].cutoff_m, "energy_cells_percent": cells_percent}
+    return {
+        "association": [{**of, "estimator": name, **_scores(rows, common)} for name, rows in results.items()],
+        "association_told": [{**of, **row} for row in calibration(said, came)],
+        "association_settings": [{**of, "tracker": kind, **asdict(chosen)} for kind, chosen in settings.items()],
+        "association_cases": [{**of, **facts}],
+    }
 
 
-def _row(name: str, rows: list[dict], common: list[np.ndarray]) -> str:
-    """One estimator's line."""
-    interval = _interval([row["distances"][:, 0] for row in rows])
-    cells = [f"{interval.value:.1f} ({interval.low:.1f} to {interval.high:.1f})"]
-    cells += [f"{np.mean([np.sqrt(row['distances'][:, part].mean()) for row in rows]):.0f}" for part in (1, 2, 3)]
-    cells.append(f"{np.mean([row['distances'][:, 4].mean() for row in rows]):.1f}")
-    shares = [100.0 * np.mean([row[key] for row in rows]) for key in ("right", "linked")]
-    cells += ["-" if np.isnan(share) else f"{share:.1f}" for share in shares]
+def _scores(rows: list[dict], common: list[np.ndarray]) -> publishing.Row:
+    """One estimator's scores over all logs: GOSPA and its parts (root mean square over time), OSPA, labels, energy score."""
+    parts = {
+        f"{name}_m": np.mean([np.sqrt(row["distances"][:, part].mean()) for row in rows])
+        for part, name in enumerate(("localisation", "missed", "false"), start=1)
+    }
+    shares = {
+        f"{name}_percent": 100.0 * np.mean([row[key] for row in rows])
+        for name, key in (("labels", "right"), ("links", "linked"))
+    }
     energy = np.concatenate([row["energy"][is_common] for row, is_common in zip(rows, common, strict=True)])
-    cells.append(f"{energy.mean():.1f}" if np.isfinite(energy).all() else "-")
-    return f"| {name} | " + " | ".join(cells) + " |"
+    return {
+        **publishing.columns("gospa_m", _interval([row["distances"][:, 0] for row in rows])), **parts,
+        "ospa_m": np.mean([row["distances"][:, 4].mean() for row in rows]), **shares, "energy_m": energy.mean(),
+    }  # fmt: skip
 
 
 def _interval(gospas: Sequence[Float64s]) -> Interval:
@@ -267,83 +277,47 @@ def _interval(gospas: Sequence[Float64s]) -> Interval:
     return bootstrap_mean(values, groups, np.random.default_rng(0))
 
 
-ROW_HEAD = """| estimator | GOSPA, m (95 %) | localisation | missed | false | OSPA, m | labels, % | links, % | energy, m |
-|---|---|---|---|---|---|---|---|---|"""
-CALIBRATION_HEAD = """| P(detection -> agent) said | cases | mean said | came true |
-|---|---|---|---|"""
+def section(measured: Measurement) -> str:
+    """Both cases, and how often what is said of a detection comes true."""
+    parts = []
+    for case in measured.rows("cases"):
+        lines = []
+        for row in measured.rows(case=case["case"]):
+            numbers = [f"{row[name]:.0f}" for name in ("missed_m", "false_m")]
+            others = [row[name] for name in ("labels_percent", "energy_m")]
+            numbers += ["–" if value is None else f"{value:.0f}" for value in others]
+            lines.append([row["estimator"], publishing.interval(row, "gospa_m", ".0f"), *numbers])
+        title = f"{case['case']} ({case['num_logs']} {'log' if case['num_logs'] == 1 else 'logs'})"
+        heads = [title, "GOSPA, m", "missed, m", "false, m", "labels, %", "energy, m"]
+        parts.append(publishing.table(heads, lines))
+    names = [case["case"] for case in measured.rows("cases")]
+    bins = list(dict.fromkeys((row["said_from"], row["said_to"]) for row in measured.rows("told")))
+    lines = []
+    for low, high in bins:
+        found = [measured.rows("told", case=name, said_from=low, said_to=high) for name in names]
+        cells = [f"{rows[0]['came_true']:.2f} of {rows[0]['num_cases']}" if rows else "–" for rows in found]
+        lines.append([f"{low:g} to {high:g}", *cells])
+    heads = ["said: P(detection → agent)", *(f"{name}: came true" for name in names)]
+    return "\n\n".join([*parts, publishing.table(heads, lines)])
 
 
 def main() -> int:
-    """The tables, printed and published."""
+    """Measure, print and publish."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--episodes", type=int, default=60)
     parser.add_argument("--jobs", type=int, default=2, help="processes")
     parser.add_argument("--without-ships", action="store_true", help="leave out the recorded ships, which take longest")
     parser.add_argument("--without-run", action="store_true", help="leave out `cadence run` on the ships")
-    parser.add_argument("--publish", type=Path, help="folder for association.md")
+    parser.add_argument("--publish", type=Path, metavar="DOCS", help="write numbers and section below this folder")
     arguments = parser.parse_args()
-    from pipeline.provenance import versions
-
-    text = HEAD.format(
-        num_ways=NUM_WAYS,
-        flags=" --without-run" * arguments.without_run,
-        seed=HELD_OUT_SEED,
-        episodes=arguments.episodes,
-        versions=", ".join(f"{n} {v}" for n, v in versions().items()),
-    )
-    text += "\n".join(table(rendezvous_case(arguments.episodes), arguments.jobs, {})) + "\n"
-    further: dict[str, Estimator] = {} if arguments.without_run else {"run": recorded}
+    found = tables(rendezvous_case(arguments.episodes), arguments.jobs, {})
     if SHIPS.is_file() and not arguments.without_ships:
-        text += SHIPS_HEAD + RUN_HEAD * len(further) + "\n".join(table(ships_case(), arguments.jobs, further)) + "\n"
-    sys.stdout.write(text)
-    if arguments.publish is not None:
-        write_atomic(arguments.publish / "association.md", text)
+        further: dict[str, Estimator] = {} if arguments.without_run else {"run": recorded}
+        for name, rows in tables(ships_case(), arguments.jobs, further).items():
+            found[name] += rows
+    facts = publishing.facts_of("association") | {"seed": HELD_OUT_SEED, "num_ways": NUM_WAYS}
+    publishing.publish(Measurement("association", facts, found), section, arguments.publish)
     return 0
-
-
-HEAD = """# Who tells targets apart where a log does not say which detection came from whom?
-
-    python benchmarks/association.py{flags}
-
-One stream of detections without identity, all of it known (retrospective). *Association* is this project's: ways to read the
-stream by a particle filter, the detections that a way gives to an agent smoothed by the bank; the way that agrees most with
-all, and the mean of {num_ways} ways as sets (matched at every moment to the first). *GNN* and *JPDA* are Stone Soup's trackers
-(constant velocity) with its Rauch-Tung-Striebel smoother; noise, gate and patience are searched by GOSPA on four other episodes
-(ships: on the first quarter of the log, which is not scored), one after the other, each as far as it gets better. *True
-origins* is the bank given the truth's labels: what is left is not association. The rule for the way that stands first was
-settled with these 20 episodes in view; nothing else of ours was.
-
-GOSPA with order p = 2 and alpha = 2, mean over time, metres; its parts as root mean square, metres; OSPA with the same order
-and cut-off. Labels: those that are right, names matched one to one once a log. Links: two successive detections of a target
-that have one label.
-Energy: energy score of the track that GOSPA assigns to a target, over the targets and moments to which every estimator assigns
-one, so that it says nothing of targets that were missed. Intervals: bootstrap over episodes (ships: over blocks of ten minutes
-of the one log).
-
-Versions: {versions}.
-
-## Rendezvous: three targets that meet, wait and leave together, or do not
-
-{episodes} episodes of seed {seed}; 10 to 12 % of the steps of each target detected, exact positions. The number of targets is
-told to all: of the trackers' tracks the three with most detections count, held still before their first and after their last
-detection. Cut-off c = 1000 m.
-
-"""
-SHIPS_HEAD = """
-## Ships: 12 real tracks, reports without identity
-
-12 % of the reports, 15 m noise; the number of ships is told to nobody. A track exists from its first to its last detection.
-Two ships lie within 20 m of each other at one berth from the 5th to the 41st minute, and five to seven have another one within
-300 m most of the time: much of who is who cannot be known, and what is said of it should be as unsure as that.
-Cut-off c = 100 m. The rows of this project are the bank alone. Its association was developed on other episodes of rendezvous
-and with a look at the first half of this log, of which a part is scored.
-
-"""
-RUN_HEAD = """*cadence run* is the pipeline with the general checkpoint, end to end, with half as many windows as by default:
-each moment is read from the first window whose origin lies at least two minutes later (at most four), so that this row knows
-less than the others; labels are those of the last window.
-
-"""
 
 
 if __name__ == "__main__":

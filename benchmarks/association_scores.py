@@ -5,9 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from association_logs import Estimate, Log
 from scipy.optimize import linear_sum_assignment
 
+from benchmarks.association_logs import Estimate, Log
 from cadence.arrays import Bools, Float64s, Int64s
 from cadence.association.types import CLUTTER
 from cadence.metrics import energy_score, gospa, ospa
@@ -95,12 +95,12 @@ def told(probability: Float64s, origin: Int64s) -> tuple[Float64s, Bools]:
     return said, np.concatenate([origin == column for _, column in pairs])
 
 
-def calibration(said: Float64s, came: Float64s) -> list[str]:
+def calibration(said: Float64s, came: Float64s) -> list[dict[str, float]]:
     """How often what is said comes true, in five bins."""
-    lines = []
+    rows = []
     for low, high in itertools.pairwise((0.0, 0.1, 0.5, 0.9, 0.99, 1.0 + 1e-9)):
         inside = (said >= low) & (said < high)
         if inside.any():
-            means = f"{said[inside].mean():.3f} | {came[inside].mean():.3f}"
-            lines.append(f"| {low:g} to {min(high, 1.0):g} | {inside.sum()} | {means} |")
-    return lines
+            means = {"mean_said": said[inside].mean(), "came_true": came[inside].mean()}
+            rows.append({"said_from": low, "said_to": min(high, 1.0), "num_cases": int(inside.sum()), **means})
+    return rows

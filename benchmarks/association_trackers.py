@@ -14,9 +14,9 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from association_logs import Estimate, Log
-from rts_smoother import rts_smoothed
 
+from benchmarks.association_logs import Estimate, Log
+from benchmarks.rts_smoother import rts_smoothed
 from cadence.arrays import Float64s
 from cadence.association.types import CLUTTER
 from pipeline.files import write_atomic
@@ -104,7 +104,7 @@ def _searched_along(name: str, factor: float, kind: str, logs: Sequence[Log], be
 
 
 def _mean_gospa(kind: str, logs: Sequence[Log], settings: Settings, folder: Path) -> float:
-    from association_scores import gospas
+    from benchmarks.association_scores import gospas
 
     file = folder / f"{kind}_{settings.label}.json"
     if not file.is_file():

@@ -3,7 +3,7 @@
 The shipped network of the world rendezvous draws 30 joint hypotheses for a window of A agents, once with its attention and once
 with it switched off (every agent for itself). Processor time of one thread, both ways in turn in every round, the median round.
 
-    python benchmarks/attention_cost.py --publish docs/benchmarks
+    python -m benchmarks.attention_cost --publish docs
 """
 
 import argparse
@@ -15,12 +15,13 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from benchmarks import publishing
+from benchmarks.publishing import Measurement
 from cadence.diffusion.scene import SceneModel
 from cadence.recordings import ForecastWindows, cut_windows
 from cadence.worlds.rendezvous import RendezvousConfig, simulate_rendezvous_batch
 from pipeline.checkpoints import find_checkpoint
 from pipeline.estimators.scene import load_scene
-from pipeline.files import write_atomic
 
 AGENTS = (1, 2, 4, 8, 16, 32)
 NUM_HYPOTHESES = 30
@@ -43,17 +44,31 @@ def main() -> None:
                 if number:  # the first round warms up
                     times[name].append(time.process_time() - begun)
         rows.append((agents, *(statistics.median(times[name]) for name in ("together", "alone"))))
-    page = _render(rows, options.rounds)
-    print(page)
-    if options.publish is not None:
-        write_atomic(options.publish / "attention_cost.md", page)
+    base = rows[0][2]
+    table = [
+        {"num_agents": agents, "alone": alone / base, "together": together / base, "together_over_alone": together / alone}
+        for agents, together, alone in rows
+    ]
+    facts = publishing.facts_of("attention_cost") | {"num_rounds": options.rounds, "num_hypotheses": NUM_HYPOTHESES}
+    publishing.publish(Measurement("attention_cost", facts, {"attention_cost": table}), section, options.publish)
+
+
+def section(measured: Measurement) -> str:
+    """Times over that of one agent."""
+    rows = measured.rows()
+    heads = ["processor time, one agent alone = 1", *(f"{row['num_agents']} agents" for row in rows)]
+    lines = [
+        ["every agent for itself", *(f"{row['alone']:.1f}" for row in rows)],
+        ["all together", *(f"{row['together']:.1f}" for row in rows)],
+    ]
+    return publishing.table(heads, lines)
 
 
 def _options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rounds", type=int, default=7)
     parser.add_argument("--checkpoint", default="rendezvous")
-    parser.add_argument("--publish", type=Path, metavar="DIR", help="write attention_cost.md there")
+    parser.add_argument("--publish", type=Path, metavar="DOCS", help="write numbers and section below this folder")
     return parser.parse_args()
 
 
@@ -70,24 +85,6 @@ def _windows(agents: int) -> ForecastWindows:
     """One window in the middle of an episode of so many agents, all detected before."""
     episodes = simulate_rendezvous_batch(RendezvousConfig(num_agents=agents), 7, np.arange(1))
     return cut_windows(episodes.recordings, np.array([0]), episodes.length[:1] // 2)
-
-
-def _render(rows: list[tuple[int, float, float]], rounds: int) -> str:
-    base = rows[0][2]
-    lines = [
-        "# What attention between agents costs",
-        "",
-        f"Made by `python benchmarks/attention_cost.py --publish docs/benchmarks`: {NUM_HYPOTHESES} joint hypotheses for one",
-        f"window of A agents, six steps of DPM-Solver++, one thread, median of {rounds} rounds. Times over that of one agent.",
-        "",
-        "| agents | every agent for itself | all together | together over alone |",
-        "|---|---|---|---|",
-        *(
-            f"| {agents} | {alone / base:.2f} | {together / base:.2f} | {together / alone:.2f} |"
-            for agents, together, alone in rows
-        ),
-    ]
-    return "\n".join(lines) + "\n"
 
 
 if __name__ == "__main__":

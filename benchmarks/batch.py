@@ -3,7 +3,7 @@
 Simulated logs and five broken ones among them are run twice, by one worker and by several, into folders of their own, one run
 right after the other. Then windows of one log are drawn by the shipped `prison` checkpoint alone and together.
 
-    python benchmarks/batch.py --publish docs/benchmarks
+    python -m benchmarks.batch --publish docs
 """
 
 import argparse
@@ -16,15 +16,16 @@ from pathlib import Path
 
 import torch
 
+from benchmarks import publishing
+from benchmarks.publishing import Measurement
 from cadence.constraints.obstacles import Obstacles
 from pipeline.batch.config import RunConfig
 from pipeline.batch.run import run
 from pipeline.checkpoints import checkpoint_hash, find_checkpoint
 from pipeline.config import stage_config
 from pipeline.estimators.scene import load_scene, scene_grid
-from pipeline.files import hash_file, write_atomic
+from pipeline.files import hash_file
 from pipeline.progress import Progress
-from pipeline.provenance import versions
 from pipeline.simulate.stage import SimulateConfig, simulate
 from pipeline.tables import read_table
 from pipeline.windows import build_windows, plan_grid
@@ -54,8 +55,8 @@ def write_logs(folder: Path, count: int) -> None:
 class Batches:
     """The runs with one worker and with several: a row each, a row for every log that failed, and what was compared."""
 
-    rows: list[str]
-    failures: list[str]
+    rows: list[publishing.Row]
+    failures: list[publishing.Row]
     num_files: int
     num_windows: int
 
@@ -63,7 +64,7 @@ class Batches:
 def run_batches(folder: Path, num_workers: int) -> Batches:
     """Run the logs by one worker and by several; raises `SystemExit` where the runs differ, or other logs fail."""
     config = stage_config(RunConfig, None, None, SETTINGS)
-    rows, failures, first_s, first = [], list[str](), 0.0, dict[str, str]()
+    rows, failures, first_s, first = [], list[publishing.Row](), 0.0, dict[str, str]()
     run(
         [str(folder / f"logs/patrol-{SEED}-0000.mcap")], str(folder / "warm"), config, _QUIET, num_workers=1
     )  # imports once for all
@@ -74,15 +75,16 @@ def run_batches(folder: Path, num_workers: int) -> Batches:
         found = {str(path.relative_to(out)): hash_file(path) for path in out.glob("*/*")}
         first_s, first = first_s or elapsed_s, first or found
         told = {o.task.name: o.message.replace(f"{folder / 'logs'}/", "") for o in outcomes if o.status != "done"}
-        rows.append(f"| {workers} | {len(outcomes) - len(told)} | {len(told)} | {first_s / elapsed_s:.2f} | yes |")
-        failures = failures or [f"| {name} | {message} |" for name, message in told.items()]
+        counts = {"num_workers": workers, "num_finished": len(outcomes) - len(told), "num_failed": len(told)}
+        rows.append({**counts, "speed": first_s / elapsed_s, "same_bytes": "yes"})
+        failures = failures or [{"log": name, "message": message} for name, message in told.items()]
         if found != first or len(told) != NUM_BROKEN or not all(name.endswith("-broken") for name in told):
             raise SystemExit("\n".join([f"batch: {workers} workers gave other files, or other logs failed:", *told]))
     windows = [stage.summary["num_windows"] for o in outcomes for stage in o.stages if stage.stage == "infer"]
     return Batches(rows, failures, len(first), sum(windows))
 
 
-def window_table(detections_path: Path, num_hypotheses: int = 30) -> list[str]:
+def window_rows(detections_path: Path, num_hypotheses: int = 30) -> list[publishing.Row]:
     """A row for each number of windows that are drawn together: processor time a window, and whether the bits are the same."""
     detections, _ = read_table(detections_path, "detections")
     model = load_scene(find_checkpoint("prison"))
@@ -94,21 +96,21 @@ def window_table(detections_path: Path, num_hypotheses: int = 30) -> list[str]:
         return model.sample(batch[part], num_hypotheses).position_m.nan_to_num()
 
     together = draw(torch.arange(count))
-    lines, alone_s = [], 0.0
+    rows, alone_s = [], 0.0
     for size in [size for size in SIZES if size <= count]:
         begin_s, difference_m = time.process_time(), 0.0
         for part in torch.arange(count).split(size):
             difference_m = max(difference_m, float((draw(part) - together[part]).abs().max()))
         elapsed_s = time.process_time() - begin_s
         alone_s = alone_s or elapsed_s
-        lines.append(f"| {size} | {alone_s / elapsed_s:.2f} | {difference_m:.3f} |")
-    return lines
+        rows.append({"windows_together": size, "speed": alone_s / elapsed_s, "difference_m": difference_m})
+    return rows
 
 
 def main() -> int:
-    """Both tables, printed and published."""
+    """Measure, print and publish."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--publish", type=Path, help="folder for batch.md")
+    parser.add_argument("--publish", type=Path, metavar="DOCS", help="write numbers and section below this folder")
     parser.add_argument("--logs", type=int, default=100, help="logs, the broken ones included")
     parser.add_argument("--workers", type=int, default=max(2, len(os.sched_getaffinity(0))), help="of the second run")
     arguments = parser.parse_args()
@@ -119,51 +121,28 @@ def main() -> int:
         write_logs(folder / "logs", arguments.logs - NUM_BROKEN)
         batches = run_batches(folder, arguments.workers)
         detections = max((folder / "workers-1").glob("*/detections.parquet"), key=lambda path: (path.stat().st_size, path))
-        windows = window_table(detections)
-    text = HEAD.format(
-        num_logs=arguments.logs, num_broken=NUM_BROKEN, cores=len(os.sched_getaffinity(0)), settings="`, `".join(SETTINGS),
-        simulate="`, `".join(SIMULATE), batch="\n".join(batches.rows), windows="\n".join(windows),
-        failures="\n".join(batches.failures), num_files=batches.num_files, num_windows=batches.num_windows,
-        num_running=num_running, seed=SEED,
-        checkpoint=f"prison, {checkpoint_hash(find_checkpoint('prison'))}",
-        versions=", ".join(f"{name} {number}" for name, number in versions().items()),
-    )  # fmt: skip
-    sys.stdout.write(text)
-    if arguments.publish is not None:
-        write_atomic(arguments.publish / "batch.md", text)
+        windows = window_rows(detections)
+    facts = publishing.facts_of("batch") | {
+        "checkpoint": {"prison": checkpoint_hash(find_checkpoint("prison"))}, "seed": SEED, "num_logs": arguments.logs,
+        "num_broken": NUM_BROKEN, "num_hyperthreads": len(os.sched_getaffinity(0)), "load_at_start": num_running,
+        "num_windows": batches.num_windows, "num_files": batches.num_files, "settings": [*SIMULATE, *SETTINGS],
+    }  # fmt: skip
+    tables = {"batch": batches.rows, "batch_failures": batches.failures, "batch_windows": windows}
+    publishing.publish(Measurement("batch", facts, tables), section, arguments.publish)
     return 0
 
 
-HEAD = """# What do workers, and windows drawn together, bring to a batch?
-
-    python benchmarks/batch.py
-
-{num_logs} logs, {num_broken} of them broken, through all stages; one thread a worker, {cores} hyperthreads, load by other work
-at the start {num_running:.1f}. Sound logs are simulated missions of half an hour (seed {seed}), {num_windows} windows in all.
-Speed is a ratio of wall times, one run right after the other, after a run of one log that is not counted. All {num_files} files
-in the mission directories were compared byte by byte. Settings: `{simulate}`, `{settings}`.
-
-| workers | finished | failed | speed | same bytes |
-|---|---|---|---|---|
-{batch}
-
-What the batch says of the logs that failed:
-
-| log | message |
-|---|---|
-{failures}
-
-Windows of one log, 30 hypotheses each, drawn by the shipped checkpoint for the prison world, so many together; one thread,
-ratios of processor times. Draws of a window differ by rounding alone where few windows are drawn together, because matrix
-products of other sizes add up in another order. `cadence run` draws up to 32 windows of one log together, and never windows of
-several logs: the gain would end where a log has a few windows of its own, and hypotheses would depend on which logs were given.
-
-| windows together | speed | largest difference from all together, m |
-|---|---|---|
-{windows}
-
-Checkpoint: {checkpoint}. Versions: {versions}.
-"""
+def section(measured: Measurement) -> str:
+    """What workers bring, and windows drawn together."""
+    facts = measured.facts
+    one, several = measured.rows()
+    together = ", ".join(f"{row['speed']:.2f} ({row['windows_together']})" for row in measured.rows("windows"))
+    return "\n\n".join([
+        f"{facts['num_logs']} logs, {facts['num_broken']} of them broken, {facts['num_windows']} windows: "
+        f"{several['num_workers']} workers are {several['speed']:.2f} times as fast as one. {one['num_finished']} logs finish, "
+        f"{one['num_failed']} fail with a reason each, and all {facts['num_files']} files are the same to the byte.",
+        f"Speed of drawing so many windows of one log together, over one by one: {together}.",
+    ])  # fmt: skip
 
 
 if __name__ == "__main__":

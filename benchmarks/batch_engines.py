@@ -3,7 +3,7 @@
 Simulated logs are run through the local engine and through Ray, each with the same number of workers and the same settings.
 Every published file is hashed; the wall time of each engine includes the start of its workers.
 
-    python benchmarks/batch_engines.py --publish docs/benchmarks
+    python -m benchmarks.batch_engines --publish docs
 """
 
 import argparse
@@ -13,13 +13,14 @@ import tempfile
 import time
 from pathlib import Path
 
+from benchmarks import publishing
+from benchmarks.publishing import Measurement
 from pipeline.batch.config import RunConfig
 from pipeline.batch.outcome import LogOutcome, exit_code
 from pipeline.batch.run import run
 from pipeline.config import stage_config
-from pipeline.files import hash_file, write_atomic
+from pipeline.files import hash_file
 from pipeline.progress import Progress
-from pipeline.provenance import versions
 from pipeline.simulate.stage import SimulateConfig, simulate
 
 QUIET = Progress(quiet=True)
@@ -48,12 +49,12 @@ def hashes(out: Path, name: str) -> dict[str, str]:
 
 
 def main() -> int:
-    """The table, printed and published; 1 where the engines differ."""
+    """Measured, printed and published; 1 where the engines differ."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--num-logs", type=int, default=100)
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--checkpoint", default="none", help="name of a checkpoint; none: the bank alone")
-    parser.add_argument("--publish", type=Path, help="folder for batch_engines.md")
+    parser.add_argument("--publish", type=Path, metavar="DOCS", help="write numbers and section below this folder")
     arguments = parser.parse_args()
     num_running = os.getloadavg()[0]
     with tempfile.TemporaryDirectory() as work:
@@ -67,22 +68,20 @@ def main() -> int:
     is_equal = tables[0] == tables[1] and len(tables[0]) == len(logs) and files[0] == files[1]
     num_same = sum(tables[1].get(name) == digest for name, digest in tables[0].items())
     num_files = sum(files[1].get(name) == digest for name, digest in files[0].items())
-    made_with = ", ".join(f"{name} {number}" for name, number in versions().items())
-    text = HEAD.format(
-        num_logs=len(logs), workers=arguments.workers, checkpoint=arguments.checkpoint, versions=made_with,
-        cpus=len(os.sched_getaffinity(0)), num_running=num_running, seed=SEED, num_windows=num_windows(local),
-        settings="`, `".join((*SIMULATED, *SETTINGS)),
-    )  # fmt: skip
     for outcome in (*local, *ray):
         if outcome.message:
             sys.stderr.write(f"{outcome.message}\n")
-    text += f"| missions that went through, local and Ray | {done(local)} and {done(ray)} of {len(logs)} |\n"
-    text += f"| hypotheses.parquet with the same bytes | {num_same} of {len(logs)} |\n"
-    text += f"| all files with the same bytes | {num_files} of {len(files[0])} |\n"
-    text += f"| wall time of Ray against local workers | {ray_s / local_s:.2f} |\n"
-    sys.stdout.write(text)
-    if arguments.publish is not None:
-        write_atomic(arguments.publish / "batch_engines.md", text)
+    row = {
+        "num_missions": len(logs), "num_finished_local": done(local), "num_finished_ray": done(ray),
+        "num_same_hypotheses": num_same, "num_files": len(files[0]), "num_same_files": num_files,
+        "ray_over_local_wall": ray_s / local_s,
+    }  # fmt: skip
+    facts = publishing.facts_of("batch_engines") | {
+        "seed": SEED, "num_windows": num_windows(local), "num_workers": arguments.workers,
+        "num_hyperthreads": len(os.sched_getaffinity(0)), "load_at_start": num_running,
+        "settings": [*SIMULATED, *SETTINGS, f"infer.checkpoint={arguments.checkpoint}"],
+    }  # fmt: skip
+    publishing.publish(Measurement("batch_engines", facts, {"batch_engines": [row]}), section, arguments.publish)
     return 0 if is_equal and not exit_code(local) and not exit_code(ray) else 1
 
 
@@ -96,20 +95,14 @@ def num_windows(outcomes: tuple[LogOutcome, ...]) -> int:
     return sum(stage.summary["num_windows"] for outcome in outcomes for stage in outcome.stages if stage.stage == "infer")
 
 
-HEAD = """# Do local workers and Ray give the same hypotheses, and what does Ray cost?
-
-    python benchmarks/batch_engines.py --num-logs {num_logs} --workers {workers} --checkpoint {checkpoint}
-
-{num_logs} simulated missions of half an hour (seed {seed}, {num_windows} windows) through `cadence run`, once with `--engine
-local` and then with `--engine ray` on the same machine: {cpus} hyperthreads, load by other work at the start {num_running:.1f},
-{workers} workers each, one thread a worker. Every file of every mission is hashed. The wall times include the start of the
-workers, and for Ray that of Ray itself; where other work goes on, their ratio is rough. Settings:
-`{settings}`.
-Checkpoint: {checkpoint}. Versions: {versions}.
-
-| what | value |
-|---|---|
-"""
+def section(measured: Measurement) -> str:
+    """Whether the files are the same, and how long Ray takes."""
+    (row,) = measured.rows()
+    return (
+        f"Of {row['num_missions']} missions {row['num_finished_local']} finish by local workers and {row['num_finished_ray']} "
+        f"on Ray; {row['num_same_files']} of {row['num_files']} files have the same bytes. Ray takes "
+        f"{row['ray_over_local_wall']:.2f} times as long, its start included."
+    )
 
 
 if __name__ == "__main__":

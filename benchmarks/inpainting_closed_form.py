@@ -4,20 +4,20 @@ The network is replaced by the exact denoiser of a Gaussian process of tracks (i
 seen the detections with an error of a few step lengths, as trained networks do. No training, seconds on one thread; the exact
 posterior, in which the detections are exact, is the row to meet.
 
-    python benchmarks/inpainting_closed_form.py --publish docs/benchmarks
+    python -m benchmarks.inpainting_closed_form --publish docs
 """
 
 import argparse
-import sys
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
+from benchmarks import publishing
+from benchmarks.publishing import Measurement
 from cadence.diffusion.inpainting import grid_detections, known_cells, overwritten, overwritten_at_level, smoother_correction
 from cadence.diffusion.sampler import sample_ddpm, sample_dpmpp_2m
 from cadence.diffusion.schedule import cosine_schedule
-from pipeline.files import write_atomic
 
 T, STEP, MEMORY, RATE = 64, 0.02, 8.0, 0.12
 MODES = ("none", "overwrite", "noise_matched", "smoother")
@@ -38,19 +38,23 @@ def conditioned(kernel: Tensor, is_seen: Tensor, values: Tensor, sigma: float) -
     return gain @ values, kernel - gain @ kernel
 
 
-def row(name: str, position: Tensor, truth: Tensor, is_seen: Tensor) -> str:
-    """One line of the table; lengths and errors in typical steps."""
+def row(position: Tensor, truth: Tensor, is_seen: Tensor) -> publishing.Row:
+    """Lengths of steps (mean, and that which 95 % do not exceed) and errors, in typical steps."""
     step = (position[:, :, 1:] - position[:, :, :-1]).norm(dim=-1) / STEP
     is_edge = (is_seen[:, 1:] != is_seen[:, :-1])[:, None].expand(step.shape)
     is_far = ~(is_seen[:, 1:] | is_seen[:, :-1])[:, None].expand(step.shape)
-    lengths = [f"{step[mask].mean():.2f} / {step[mask].quantile(0.95):.2f}" for mask in (is_edge, is_far)]
+    found: publishing.Row = {}
+    for name, mask in (("step_at_edges", is_edge), ("step_elsewhere", is_far)):
+        found |= {f"{name}_mean": float(step[mask].mean()), f"{name}_95": float(step[mask].quantile(0.95))}
     error = (position - truth[:, None]).norm(dim=-1).mean(dim=1) / STEP
     of_mean = (position.mean(dim=1) - truth).norm(dim=-1) / STEP
-    values = [f"{value:.2f}" for value in (error[is_seen].mean(), error[~is_seen].mean(), of_mean[~is_seen].mean())]
-    return f"| {name} | " + " | ".join([*lengths, *values]) + " |"
+    return found | {
+        "error_where_seen": float(error[is_seen].mean()), "error_elsewhere": float(error[~is_seen].mean()),
+        "error_of_mean_elsewhere": float(of_mean[~is_seen].mean()),
+    }  # fmt: skip
 
 
-def table(floor_steps: float, num_windows: int, num: int, seed: int) -> list[str]:
+def rows_of(floor_steps: int, num_windows: int, num: int, seed: int) -> list[publishing.Row]:
     """Rows for a network that knows detections to `floor_steps` step lengths."""
     generator = torch.Generator().manual_seed(seed)
     kernel = prior()
@@ -75,7 +79,11 @@ def table(floor_steps: float, num_windows: int, num: int, seed: int) -> list[str
     spread, turn = torch.linalg.eigh(exact_covariance)
     shape = (num_windows, num, T, 2)
     drawn = turn[:, None] @ (spread.clamp_min(0).sqrt()[:, None, :, None] * torch.randn(shape, generator=generator).double())
-    lines = [row("truth", truth[:, None], truth, is_seen), row("exact posterior", exact_mean[:, None] + drawn, truth, is_seen)]
+    drawn = exact_mean[:, None] + drawn
+    rows = [
+        {"known_to_steps": floor_steps, "sampler": name, "inpainting": None, **row(position, truth, is_seen)}
+        for name, position in (("truth", truth[:, None]), ("exact posterior", drawn))
+    ]
     schedule = cosine_schedule()
     angles = torch.linspace(float(schedule.angle[-1]), 0.0, 11, dtype=torch.float64)
     for sampler in ("ddpm-100", "dpmpp-10"):
@@ -94,37 +102,40 @@ def table(floor_steps: float, num_windows: int, num: int, seed: int) -> list[str
                 position = sample_ddpm(corrected, start, schedule, generator, on_state=on_state)
             else:
                 position = sample_dpmpp_2m(corrected, start, angles, on_state=on_state)
-            lines.append(row(f"{sampler}, {mode}", position, truth, is_seen))
-    return lines
+            what = {"known_to_steps": floor_steps, "sampler": sampler, "inpainting": mode}
+            rows.append({**what, **row(position, truth, is_seen)})
+    return rows
+
+
+def section(measured: Measurement) -> str:
+    """Steps at the edges, where the network knows detections to a few steps."""
+    known = max(row["known_to_steps"] for row in measured.rows())
+
+    def step(sampler: str, mode: str | None) -> str:
+        (row,) = measured.rows(known_to_steps=known, sampler=sampler, inpainting=mode)
+        return f"{row['step_at_edges_mean']:.2f}"
+
+    words = ", ".join(f"{step('ddpm-100', mode)} ({mode})" for mode in MODES[1:])
+    return (
+        f"A perfect denoiser that knows detections to {known} typical steps, mean step at the edges in these: {words}; "
+        f"the exact posterior's is {step('exact posterior', None)}."
+    )
 
 
 def main() -> None:
-    """Both tables, printed and published."""
+    """Measure, print and publish."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--publish", type=Path, help="folder for inpainting_closed_form.md")
+    parser.add_argument("--publish", type=Path, metavar="DOCS", help="write numbers and section below this folder")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--windows", type=int, default=48)
     parser.add_argument("--hypotheses", type=int, default=10)
     arguments = parser.parse_args()
     torch.set_num_threads(1)
-    head = "| sampler, inpainting | step at edges | step elsewhere | error where seen | error elsewhere | of the mean |\n|---"
-    text = [HEAD.format(command=f"python benchmarks/inpainting_closed_form.py --seed {arguments.seed}")]
-    for floor_steps in (3.0, 1.0):
-        text += [f"\n## The network knows detections to {floor_steps:g} step lengths\n", head + "|---" * 5 + "|"]
-        text += table(floor_steps, arguments.windows, arguments.hypotheses, arguments.seed)
-    sys.stdout.write("\n".join(text) + "\n")
-    if arguments.publish is not None:
-        write_atomic(arguments.publish / "inpainting_closed_form.md", "\n".join(text) + "\n")
-
-
-HEAD = """# Inpainting in closed form: does it jump?
-
-    {command}
-
-The network is the exact denoiser of a Gaussian process of tracks which knows the detections (12 % of the cells, exact) only
-roughly, as trained networks do. Step lengths at the edges (between a cell with a detection and one without) and elsewhere as
-mean / 95 % quantile, errors of samples and of their mean; all in typical step lengths. The exact posterior is the row to meet;
-samplers draw somewhat narrower than it, which alone lowers the error of a sample, so look at the error of the mean too."""
+    rows = [row for known in (3, 1) for row in rows_of(known, arguments.windows, arguments.hypotheses, arguments.seed)]
+    facts = publishing.facts_of("inpainting_closed_form")
+    facts |= {"num_windows": arguments.windows, "num_hypotheses": arguments.hypotheses}
+    measured = Measurement("inpainting_closed_form", facts, {"inpainting_closed_form": rows})
+    publishing.publish(measured, section, arguments.publish)
 
 
 if __name__ == "__main__":

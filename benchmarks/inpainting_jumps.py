@@ -4,7 +4,7 @@ A small network is trained on the patrol simulator (past and future in one windo
 every way of inpainting. Steps between a known and an unknown cell are the edges where overwriting jumps; the past between
 detections tells whether the way of inpainting also helps. The training is kept in the work folder and goes on after a kill.
 
-    nice -n 10 python benchmarks/inpainting_jumps.py --publish docs/benchmarks
+    nice -n 10 python -m benchmarks.inpainting_jumps --publish docs
 """
 
 import argparse
@@ -16,6 +16,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from benchmarks import publishing
+from benchmarks.publishing import Measurement
 from cadence.bank.rows import active_rows
 from cadence.diffusion.absolute import AbsoluteModel, AbsoluteSampling
 from cadence.diffusion.inpainting import grid_detections, known_cells
@@ -25,7 +27,6 @@ from cadence.training.loop import OptimiserConfig
 from cadence.types import Context
 from cadence.worlds.patrol import PatrolConfig, simulate_patrol
 from pipeline.estimators.paper import load_absolute
-from pipeline.files import write_atomic
 from pipeline.progress import Progress
 from pipeline.train.config import AbsoluteTraining, TrainConfig
 from pipeline.train.missions import mission_of_episode
@@ -99,33 +100,50 @@ def sampled(test: Test, sampling: AbsoluteSampling, num_hypotheses: int) -> Tens
     return torch.cat(parts)
 
 
-def row(name: str, position: Tensor, test: Test, history: int) -> str:
-    """One line of the table."""
+def row(position: Tensor, test: Test, history: int) -> publishing.Row:
+    """Lengths of steps (mean, and that which 95 % do not exceed) and errors, metres."""
     step = (position[:, :, 1:] - position[:, :, :-1]).norm(dim=-1)
     is_edge = (test.is_seen[:, 1:] != test.is_seen[:, :-1])[:, None].expand(step.shape)
     is_inside = (test.is_seen[:, 1:] & test.is_seen[:, :-1])[:, None].expand(step.shape)
     is_elsewhere = ~is_edge & ~is_inside
     is_elsewhere[:, :, history - 1 :] = False
-    lengths = [f"{step[mask].mean():.0f} / {step[mask].quantile(0.95):.0f}" for mask in (is_edge, is_inside, is_elsewhere)]
+    found: publishing.Row = {}
+    for name, mask in (("at_edges", is_edge), ("between_known", is_inside), ("elsewhere", is_elsewhere)):
+        found |= {f"step_{name}_m_mean": float(step[mask].mean()), f"step_{name}_m_95": float(step[mask].quantile(0.95))}
     error = (position - test.truth[:, None]).norm(dim=-1).mean(dim=1)
     rng = np.random.default_rng(0)
-    scores = []
     # in reach of a detection: the past no more than eight steps from one
     near = torch.nn.functional.max_pool1d(test.is_seen[:, None].float(), 17, 1, 8)[:, 0] > 0
     past = torch.arange(error.shape[1]) < history
-    for mask in (test.is_seen, past & ~test.is_seen & near, past & ~test.is_seen, ~past & ~test.is_seen):
+    parts = {
+        "where_seen": test.is_seen, "near_seen": past & ~test.is_seen & near, "past": past & ~test.is_seen,
+        "future": ~past & ~test.is_seen,
+    }  # fmt: skip
+    for name, mask in parts.items():
         count = mask.sum(dim=1).double()
         value = torch.where(count > 0, (error * mask).sum(dim=1) / count, torch.nan)
-        found = bootstrap_mean(value.numpy(), test.episode.numpy(), rng)
-        scores.append(f"{found.value:.0f} [{found.low:.0f}, {found.high:.0f}]")
-    return f"| {name} | " + " | ".join([*lengths, *scores]) + " |"
+        found |= publishing.columns(f"error_{name}_m", bootstrap_mean(value.numpy(), test.episode.numpy(), rng))
+    return found
+
+
+def section(measured: Measurement) -> str:
+    """Steps at the edges, and errors near detections."""
+    (truth,) = measured.rows(sampler="truth")
+    words = []
+    for mode in MODES[1:]:
+        (row,) = measured.rows(sampler="ddpm-100", inpainting=mode)
+        words.append(f"{row['step_at_edges_m_mean']:.0f} m and {row['error_near_seen_m']:.0f} m ({mode})")
+    return (
+        f"A small trained network, mean step at the edges and error within eight steps of a detection: {', '.join(words)}; "
+        f"true steps there are {truth['step_at_edges_m_mean']:.0f} m long."
+    )
 
 
 def main() -> None:
     """Train, sample, print and publish."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--work", type=Path, default=WORK)
-    parser.add_argument("--publish", type=Path, help="folder for inpainting.md")
+    parser.add_argument("--publish", type=Path, metavar="DOCS", help="write numbers and section below this folder")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--steps", type=int, default=1500, help="of training")
     parser.add_argument("--episodes", type=int, default=24, help="to test on")
@@ -135,41 +153,15 @@ def main() -> None:
     model = trained(arguments.work, arguments.seed, arguments.steps)
     test = test_windows(model, arguments.episodes)
     history = model.config.history_steps
-    head = (
-        "step at edges | between known cells | elsewhere in the past | error where seen | past, 8 steps around | past | future"
-    )
-    lines = [f"| sampler, inpainting | {head} |", "|---" * 8 + "|", row("truth", test.truth[:, None], test, history)]
+    rows = [{"sampler": "truth", "inpainting": None, **row(test.truth[:, None], test, history)}]
     for sampler, num_steps, num in (("dpmpp", 10, arguments.hypotheses), ("ddpm", 100, max(2, arguments.hypotheses // 4))):
         for mode in MODES:
             position = sampled(test, AbsoluteSampling(sampler, num_steps, mode), num)
-            lines.append(row(f"{sampler}-{num_steps}, {mode}", position, test, history))
-            print(lines[-1], flush=True)
-    command = f"python benchmarks/inpainting_jumps.py --seed {arguments.seed} --steps {arguments.steps}"
-    command += f" --episodes {arguments.episodes} --hypotheses {arguments.hypotheses}"
-    num_windows, num_episodes = len(test.truth), len(test.episode.unique())
-    text = TEXT.format(command=command, table="\n".join(lines), num_windows=num_windows, num_episodes=num_episodes)
-    sys.stdout.write(text)
-    if arguments.publish is not None:
-        write_atomic(arguments.publish / "inpainting.md", text)
-
-
-TEXT = """# Inpainting in absolute coordinates: does it jump?
-
-    {command}
-
-A small absolute-coordinate network (past and future in one window of 48 + 16 steps of 60 s, v-prediction) trained for a few
-CPU minutes on the patrol simulator, then {num_windows} windows of {num_episodes} other episodes. Metres.
-
-Steps: mean / 95 % quantile of the step length at the edges (between a cell with a detection and one without), between two
-cells with detections, and elsewhere in the past. Errors: mean distance of the hypotheses from the truth where something was
-seen, in the past within eight steps of a detection, in the whole unseen past, and in the future; 95 % intervals by bootstrap
-over episodes.
-
-{table}
-
-`overwrite` is the paper's way, `noise_matched` that of RePaint, `smoother` the default for networks in absolute coordinates.
-The network is far from trained out: compare the ways with one another, not with other tables.
-"""
+            rows.append({"sampler": f"{sampler}-{num_steps}", "inpainting": mode, **row(position, test, history)})
+            print(f"{sampler}-{num_steps}, {mode}", file=sys.stderr, flush=True)
+    facts = publishing.facts_of("inpainting_jumps")
+    facts |= {"num_windows": len(test.truth), "num_episodes": len(test.episode.unique())}
+    publishing.publish(Measurement("inpainting_jumps", facts, {"inpainting_jumps": rows}), section, arguments.publish)
 
 
 if __name__ == "__main__":

@@ -4,36 +4,37 @@ The library needs no training, so that it shows what a network could still learn
 energy score of the library with a growing number of simulated tracks, of the shipped network, and of forecasts of which a
 share is drawn from the library. Kept under --work: a killed run goes on.
 
-    python benchmarks/library_draws.py --reference ../shared/data/prison_reference --publish docs/benchmarks
+    python -m benchmarks.library_draws --reference ../shared/data/prison_reference --publish docs
 """
 
 import argparse
 import dataclasses
 import functools
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
 import torch
 
+from benchmarks import publishing
+from benchmarks.leads import relative_lead
+from benchmarks.publishing import Measurement
 from cadence.diffusion.scene import SceneSampling
 from cadence.types import Detections, Estimator, HypothesisSet, WindowBatch
 from pipeline.checkpoints import checkpoint_hash, find_checkpoint
 from pipeline.episodes.recordings import RecordingsConfig, RecordingSet, load_recordings
 from pipeline.estimators.scene import load_scene
-from pipeline.files import write_atomic
-from pipeline.forecast.leads import relative_lead
 from pipeline.forecast.rivals import FORECAST_RIVALS
 from pipeline.forecast.scores import HORIZONS, EpisodeScores
 from pipeline.forecast.stage import ForecastConfig, ForecastRun, forecast_windows
-from pipeline.forecast.tables import line, mean_interval, number, with_interval
+from pipeline.forecast.tables import mean_interval
 from pipeline.progress import Progress
 
 FIRST_TRACK = 500
 """Narco's checkpoint was chosen on the episodes before it, which are evaluated on here."""
-MEASURES = {"error of the mean": "mean_error", "ADE": "ade", "minADE": "min_ade_at"}
+MEASURES = {"mean_error": "mean_error", "ade": "ade", "min_ade": "min_ade_at"}
 NUM_RESAMPLES = 1000
 
 
@@ -116,40 +117,26 @@ def score_case(case: Case, episodes: RecordingSet, options: argparse.Namespace, 
     return found
 
 
-def row(name: str, own: EpisodeScores, first: EpisodeScores, unit_m: float) -> str:
+def row(key: str, name: str, own: EpisodeScores, first: EpisodeScores, unit_m: float) -> publishing.Row:
     """Energy score, what it is worse than CADENCE's by in per cent, and the other measures; means over the horizons."""
     value = mean_interval(own.measure("energy_score").mean(axis=1) / unit_m, own, 0, NUM_RESAMPLES)
-    cells = [name, with_interval(value.value, value.low, value.high)]
-    if own is first:
-        cells.append("0")
-    else:
+    lead = None
+    if own is not first:
         lead = relative_lead([own], [[first]], "energy_score", "energy_score", HORIZONS, 0, NUM_RESAMPLES)
-        cells.append(with_interval(-100 * lead.value, -100 * lead.high, -100 * lead.low, 2))
-    cells += [number(own.mean(measure).mean() / unit_m) for measure in MEASURES.values()]
-    cells.append(number(100 * own.mean("coverage_90").mean()))
-    return line(cells)
+    return {
+        "set": key, "forecast": name, **publishing.columns("energy_score", value),
+        **publishing.columns("worse_than_cadence_percent", lead, -100),
+        **{column: own.mean(measure).mean() / unit_m for column, measure in MEASURES.items()},
+        "coverage_90_percent": 100 * own.mean("coverage_90").mean(),
+    }  # fmt: skip
 
 
-def page(scores: Mapping[str, tuple[dict[str, EpisodeScores], float]], options: argparse.Namespace, command: str) -> str:
-    """The page."""
-    lines = [
-        "# What recorded tracks would add to the network", "", f"    {command}", "",
-        f"{options.windows} windows a set of validation episodes (recorded: seeds 250 to 299; ours: 100 episodes), "
-        f"{options.hypotheses} hypotheses, nobody told the hideout, no obstacles told. Tracks of the library are simulated "
-        "ones of the same set, none of them evaluated on. Rows with a share draw that many of the hypotheses from the library "
-        "and the others from the network. Energy score, error of the mean, ADE and minADE are means over the horizons 0 to "
-        "120 min over the map's side; *worse by* is the energy score against CADENCE's, negative where better. Brackets: 95 % "
-        "bootstrap over episodes, paired.", "",
-    ]  # fmt: skip
-    for name, (rows, unit_m) in scores.items():
-        lines += [
-            f"## {name}",
-            "",
-            line(["", "energy score", "worse by, %", *MEASURES, "90 % region holds, %"]),
-            line(["---"] * 7),
-        ]
-        lines += [row(title, own, rows["CADENCE"], unit_m) for title, own in rows.items()] + [""]
-    return "\n".join(lines)
+def section(measured: Measurement) -> str:
+    """What a share of hypotheses out of the library with the most tracks changes in the energy score."""
+    name = measured.rows()[-1]["forecast"]
+    rows = measured.rows(forecast=name)
+    lines = [[row["set"], publishing.interval(row, "worse_than_cadence_percent", "z.0f")] for row in rows]
+    return publishing.table(["set", f"{name}: worse than CADENCE alone, %"], lines)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -161,7 +148,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--hypotheses", type=int, default=30)
     parser.add_argument("--tracks", type=int, nargs="+", default=[300, 3500])
     parser.add_argument("--shares", type=float, nargs="+", default=[0.5])
-    parser.add_argument("--publish", type=Path, help="folder for library_draws.md")
+    parser.add_argument("--publish", type=Path, metavar="DOCS", help="write numbers and section below this folder")
     options = parser.parse_args(arguments)
     torch.set_num_threads(1)
     progress, scores = Progress(), {}
@@ -170,10 +157,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         episodes = load_recordings(case.episodes, options.work / "episodes", progress)
         assert episodes.scale_m is not None
         scores[case.name] = (score_case(case, episodes, options, progress), episodes.scale_m)
-    text = page(scores, options, " ".join(["python benchmarks/library_draws.py", *sys.argv[1:]]))
-    sys.stdout.write(text)
-    if options.publish is not None:
-        write_atomic(options.publish / "library_draws.md", text)
+    rows = [
+        row(key, title, own, found["CADENCE"], unit_m)
+        for key, (found, unit_m) in scores.items()
+        for title, own in found.items()
+    ]
+    facts = publishing.facts_of("library_draws", arguments)
+    facts |= {"num_windows": options.windows, "num_hypotheses": options.hypotheses}
+    publishing.publish(Measurement("library_draws", facts, {"library_draws": rows}), section, options.publish)
     return 0
 
 

@@ -3,7 +3,7 @@
 A mixed log of ten topics is written into a temporary folder (see `mixed_logs`), then both sides read it in turns, in one
 process. Peak memory is that of a process of its own for every size, as the operating system counts it.
 
-    python benchmarks/log_reading.py --publish docs/benchmarks
+    python -m benchmarks.log_reading --publish docs
 """
 
 import argparse
@@ -19,6 +19,9 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+from benchmarks import publishing
+from benchmarks.publishing import Measurement
 
 SIZE_MB = 300.0
 OTHER_FORMS_MB = 40.0
@@ -42,15 +45,6 @@ class Cost:
     cpu_s: float
 
 
-@dataclass(frozen=True)
-class Row:
-    """What both sides did, and what it cost each."""
-
-    what: str
-    theirs: Cost
-    ours: Cost
-
-
 def peak_of(command: str, path: Path | str) -> tuple[int, float, float]:
     """Exit code, peak of the resident memory in bytes and CPU seconds of a child process. This process must stay small."""
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
@@ -60,9 +54,17 @@ def peak_of(command: str, path: Path | str) -> tuple[int, float, float]:
         return child.returncode, usage.ru_maxrss * _UNIT, usage.ru_utime + usage.ru_stime
 
 
-def memory_lines(folder: Path, sizes_mb: Iterable[float]) -> list[str]:
+def row_of(log: str, what: str, theirs: Cost, ours: Cost) -> publishing.Row:
+    """What both sides did, and what it cost each."""
+    return {
+        "log": log, "what": what, "theirs_s": theirs.wall_s, "ours_s": ours.wall_s, "ratio": theirs.wall_s / ours.wall_s,
+        "theirs_cpu_s": theirs.cpu_s, "ours_cpu_s": ours.cpu_s, "cpu_ratio": theirs.cpu_s / ours.cpu_s,
+    }  # fmt: skip
+
+
+def memory_rows(folder: Path, sizes_mb: Iterable[float]) -> list[publishing.Row]:
     """Peak memory over the size of the log: checked, then read as a whole."""
-    lines = [f"| none: only imports | - | {peak_of(_IMPORT, '')[1] / 1e6:.0f} |"]
+    rows = [{"log": "none: only imports", "size_mb": None, "peak_mb": peak_of(_IMPORT, "")[1] / 1e6}]
     for size_mb in sizes_mb:
         path = folder / "large.mcap"
         command = "import sys; from pathlib import Path; from benchmarks.mixed_logs import write_mixed_log"
@@ -71,12 +73,12 @@ def memory_lines(folder: Path, sizes_mb: Iterable[float]) -> list[str]:
         code, peak, _ = peak_of(_READ, path) if code == 0 else (code, 0, 0.0)
         if code:
             raise SystemExit(f"log_reading: a log of {size_mb} MB ended with exit code {code}")
-        lines.append(f"| mixed log | {path.stat().st_size / 1e6:.0f} | {peak / 1e6:.0f} |")
+        rows.append({"log": "mixed log", "size_mb": path.stat().st_size / 1e6, "peak_mb": peak / 1e6})
         path.unlink()
-    return lines
+    return rows
 
 
-def bomb_lines(folder: Path) -> list[str]:
+def bomb_rows(folder: Path) -> list[publishing.Row]:
     """Seconds and peak memory of opening two small files that want to fill the memory or to keep the processor busy."""
     import zstandard
 
@@ -88,14 +90,15 @@ def bomb_lines(folder: Path) -> list[str]:
         "a message of 2 GiB, as it says": start + struct.pack("<BQ", 5, 2**31) + bytes(65_000),
         "a chunk of 256 MiB of zeros": start + struct.pack("<BQ", 6, len(head) + len(packed)) + head + packed,
     }
-    lines = []
+    rows = []
     for name, data in bombs.items():
         path = folder / "bomb.mcap"
         path.write_bytes(data)
         code, peak, seconds = peak_of(_OPEN, path)
         verdict = "named as damaged" if code == 0 else "NOT NOTICED"
-        lines.append(f"| {name} | {len(data) / 1e3:.0f} | {verdict} | {seconds:.1f} | {peak / 1e6:.0f} |")
-    return lines
+        sizes = {"size_kb": len(data) / 1e3, "outcome": verdict, "cpu_s": seconds, "peak_mb": peak / 1e6}
+        rows.append({"file": name, **sizes})
+    return rows
 
 
 def theirs(path: Path) -> dict[str, Callable[[], int]]:
@@ -155,7 +158,7 @@ def ours(path: Path) -> dict[str, tuple[str, Callable[[], int]]]:
     }
 
 
-def compare(path: Path, repeats: int) -> list[Row]:
+def compare(path: Path, repeats: int) -> list[publishing.Row]:
     """All rows of the table of times; both sides in turns."""
     _check_equal(path)
     their_work, our_work = theirs(path), ours(path)
@@ -163,10 +166,10 @@ def compare(path: Path, repeats: int) -> list[Row]:
     for _ in range(repeats):
         for name, work in [*their_work.items(), *((name, work) for name, (_, work) in our_work.items())]:
             costs.setdefault(name, []).append(_measure(work))
-    return [Row(name, _least(costs[other]), _least(costs[name])) for name, (other, _) in our_work.items()]
+    return [row_of("with index", name, _least(costs[other]), _least(costs[name])) for name, (other, _) in our_work.items()]
 
 
-def share_rows(path: Path, repeats: int) -> list[tuple[str, Cost]]:
+def share_rows(path: Path, repeats: int, theirs_cpu_s: float) -> list[publishing.Row]:
     """What the steps of reading all messages cost, each with all that come before it."""
     from zstandard import ZstdDecompressor
 
@@ -195,10 +198,15 @@ def share_rows(path: Path, repeats: int) -> list[tuple[str, Cost]]:
         "an object with its own bytes for each message": work["all messages"][1],
     }
     costs = [{name: _measure(step) for name, step in steps.items()} for _ in range(repeats)]
-    return [(name, _least([cost[name] for cost in costs])) for name in steps]
+    rows, before, spent = [], 0.0, {name: _least([cost[name] for cost in costs]).cpu_s for name in steps}
+    for name, cpu_s in spent.items():
+        share = 100 * (cpu_s - before) / max(spent.values())
+        rows.append({"step": name, "cpu_s": cpu_s, "share_percent": share, "ratio_at_most": theirs_cpu_s / cpu_s})
+        before = cpu_s
+    return rows
 
 
-def other_forms(folder: Path, repeats: int) -> list[Row]:
+def other_forms(folder: Path, repeats: int) -> list[publishing.Row]:
     """Logs in which every record has to be walked: without an index of chunks, and without chunks."""
     from mcap.reader import make_reader
     from mcap.writer import IndexType, Writer
@@ -234,7 +242,7 @@ def other_forms(folder: Path, repeats: int) -> list[Row]:
             others.append(_measure(theirs(path)["all"]))
             for name, work in works.items():
                 costs[name].append(_measure(work))
-        rows += [Row(f"{form}: {name}", _least(others), _least(costs[name])) for name in works]
+        rows += [row_of(form, name, _least(others), _least(costs[name])) for name in works]
     return rows
 
 
@@ -268,111 +276,50 @@ def _measure(work: Callable[[], int]) -> Cost:
 
 
 def main() -> int:
-    """The tables, printed and published."""
+    """Measure, print and publish."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--publish", type=Path, help="folder for log_reading.md")
+    parser.add_argument("--publish", type=Path, metavar="DOCS", help="write numbers and section below this folder")
     parser.add_argument("--size-mb", type=float, default=SIZE_MB, help="size of the log that is timed")
     parser.add_argument("--memory-sizes-mb", type=float, nargs="*", default=MEMORY_SIZES_MB, help="sizes for peak memory")
     parser.add_argument("--repeats", type=int, default=3, help="runs of which the fastest counts")
     arguments = parser.parse_args()
-    sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
     os.environ["PYTHONPATH"] = str(Path(__file__).resolve().parents[1])
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        memory = memory_lines(folder, arguments.memory_sizes_mb)  # first: children must not start with our peak
-        bombs = bomb_lines(folder)
+        memory = memory_rows(folder, arguments.memory_sizes_mb)  # first: children must not start with our peak
+        bombs = bomb_rows(folder)
         from benchmarks.mixed_logs import write_mixed_log
-        from pipeline.files import write_atomic
-        from pipeline.provenance import versions
 
         path = folder / "mixed.mcap"
         num_messages = write_mixed_log(path, arguments.size_mb)
         rows = compare(path, arguments.repeats)
-        shares = share_rows(path, arguments.repeats)
-        others = other_forms(folder, arguments.repeats)
+        tables = {
+            "log_reading": rows + other_forms(folder, arguments.repeats),
+            "log_reading_shares": share_rows(path, arguments.repeats, rows[0]["theirs_cpu_s"]),
+            "log_reading_memory": memory, "log_reading_bombs": bombs,
+        }  # fmt: skip
         size_mb = path.stat().st_size / 1e6
-    made_with = ", ".join(f"{name} {number}" for name, number in versions().items())
-    head = HEAD.format(size_mb=size_mb, num=num_messages, repeats=arguments.repeats, topic=TOPIC, versions=made_with)
-    text = head + "".join(map(_line, rows)) + SHARES + "".join(_share_lines(shares, rows[0].theirs))
-    text += (
-        OTHERS.format(size_mb=OTHER_FORMS_MB)
-        + "".join(map(_line, others))
-        + MEMORY
-        + "\n".join(memory)
-        + "\n"
-        + BOMBS
-        + "\n".join(bombs)
-        + "\n"
-    )
-    sys.stdout.write(text)
-    if arguments.publish is not None:
-        write_atomic(arguments.publish / "log_reading.md", text)
+    facts = publishing.facts_of("log_reading") | {
+        "num_messages": num_messages, "size_mb": size_mb, "num_repeats": arguments.repeats, "other_forms_mb": OTHER_FORMS_MB,
+    }  # fmt: skip
+    publishing.publish(Measurement("log_reading", facts, tables), section, arguments.publish)
     return 0
 
 
-def _line(row: Row) -> str:
-    wall, cpu = row.theirs.wall_s / row.ours.wall_s, row.theirs.cpu_s / row.ours.cpu_s
-    seconds = (
-        f"{row.theirs.wall_s:.2f} | {row.ours.wall_s:.2f} | **{wall:.1f}** | {row.theirs.cpu_s:.2f} | {row.ours.cpu_s:.2f}"
+def section(measured: Measurement) -> str:
+    """Ratios of processor time, memory, and files that lie about themselves."""
+    heads = ["log", "what", "times as fast"]
+    lines = [[row["log"], row["what"], f"{row['cpu_ratio']:.1f}"] for row in measured.rows()]
+    largest = max(measured.rows("memory"), key=lambda row: row["size_mb"] or 0)
+    bombs = "; ".join(f"{row['file']}: {row['peak_mb']:.0f} MB, {row['outcome']}" for row in measured.rows("bombs"))
+    facts = measured.facts
+    text = (
+        f"{facts['num_messages']} messages, {facts['size_mb']:.0f} MB. Peak memory of checking and reading a log of "
+        f"{largest['size_mb'] / 1000:.0f} GB: {largest['peak_mb']:.0f} MB; of opening small files that declare what they do "
+        f"not hold: {bombs}."
     )
-    return f"| {row.what} | {seconds} | **{cpu:.1f}** |\n"
+    return f"{publishing.table(heads, lines)}\n\n{text}"
 
-
-def _share_lines(shares: list[tuple[str, Cost]], other: Cost) -> Iterator[str]:
-    before = 0.0
-    for name, cost in shares:
-        share = (cost.cpu_s - before) / shares[-1][1].cpu_s
-        before = cost.cpu_s
-        yield f"| {name} | {cost.cpu_s:.2f} | {100 * share:.0f} % | {other.cpu_s / cost.cpu_s:.1f} |\n"
-
-
-HEAD = """# How fast are logs read?
-
-    python benchmarks/log_reading.py
-
-A mixed log as a robot records it: {num} messages of ten topics (ROS 2, CDR), {size_mb:.0f} MB, zstd; `{topic}` is
-`nav_msgs/Odometry`. Both sides read it in turns in one process, {repeats} times; the fastest run counts. *Theirs* is `mcap`
-with its defaults (index, no checksums) and `mcap-ros2-support`; *ours* checks the checksum of every chunk that it reads.
-Both give the same messages in the same order, which the script verifies by a hash. A log that was checked before (by
-`cadence ingest`) is planned by its index; the third row is the first opening, which also compares every byte with checksums,
-indexes and statistics. Both use one thread. Where other work runs on the machine meanwhile, as when this page was made, only
-the ratios of CPU time tell anything.
-
-Versions: {versions}.
-
-| what | theirs, s | ours, s | ratio | theirs, CPU s | ours, CPU s | CPU ratio |
-|---|---|---|---|---|---|---|
-"""
-SHARES = """
-## Where the time goes
-
-Each row holds all rows above it; *at most* is the ratio if nothing else had to be done. zlib-ng computes the checksums.
-
-| reading all messages | CPU s | share | at most |
-|---|---|---|---|
-"""
-OTHERS = """
-## Logs without an index
-
-{size_mb:.0f} MB of such messages in other containers, in which every record has to be walked. *Theirs* does not check anything.
-
-| what | theirs, s | ours, s | ratio | theirs, CPU s | ours, CPU s | CPU ratio |
-|---|---|---|---|---|---|---|
-"""
-MEMORY = """
-## Peak memory
-
-Logs of the same kind are opened with all checks and then read as a whole.
-
-| log | size, MB | peak, MB |
-|---|---|---|
-"""
-BOMBS = """
-## Files that declare what they do not hold
-
-| file | size, kB | outcome | CPU seconds, with the start of Python | peak, MB |
-|---|---|---|---|---|
-"""
 
 if __name__ == "__main__":
     sys.exit(main())

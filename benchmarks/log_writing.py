@@ -4,7 +4,7 @@ Scenes of three agents with thirty hypotheses of sixty steps are drawn and encod
 packing, read back with the `mcap` library, and appended to a generated log of 300 MB. Every ratio is of two times taken in this
 run, one after the other, each the best of a few.
 
-    python benchmarks/log_writing.py --publish docs/benchmarks
+    python -m benchmarks.log_writing --publish docs
 """
 
 import argparse
@@ -24,17 +24,17 @@ from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, Writer
 
+from benchmarks import publishing
+from benchmarks.publishing import Measurement
 from pipeline.export.display import Style, draw, scene_entities
 from pipeline.export.messages import encode_agents, encode_hypotheses
 from pipeline.export.playback import Scene, build_scenes, plan_ticks
 from pipeline.export.scene import Entity, encode_scene
 from pipeline.export.stage import ExportConfig, num_vertices
-from pipeline.files import write_atomic
 from pipeline.logs.append import write_combined
 from pipeline.logs.recorder import Packing
 from pipeline.logs.writer import LogWriter, schema_bytes
 from pipeline.progress import Progress
-from pipeline.provenance import versions
 from pipeline.results import AgentHypotheses, MissionHypotheses, WindowHypotheses
 from pipeline.tables import Frame
 from schemas import channels
@@ -53,6 +53,8 @@ PACKINGS = [
     for chunk_kb in (256, 1024, 2048, 4096, 8192)
 ]
 SIZE_LIMIT_MB, ENCODING_FACTOR, REWRITE_FACTOR, COPY_FACTOR = 28.0, 40.0, 10.0, 3.0
+SHOWN = (("none", 1024), ("lz4", 2048), ("zstd 1", 256), ("zstd 1", 8192), ("zstd 6", 2048))
+"""Packings of the page, beside the default."""
 QUIET = Progress(quiet=True)
 
 
@@ -137,19 +139,21 @@ def write_with_library(path: Path, messages: list[Message]) -> None:
         writer.finish()
 
 
-def packing_rows(folder: Path, fresh: list[Message], kept: list[Message]) -> list[str]:
+def packing_rows(folder: Path, fresh: list[Message], kept: list[Message]) -> list[publishing.Row]:
     """One row a packing; times as multiples of those of the default."""
     taken = {packing: measure_packing(folder / "packed.mcap", fresh, kept, packing) for packing in (Packing(), *PACKINGS)}
     base = taken[Packing()]
-    lines = []
+    rows = []
     for packing in PACKINGS:
         fresh_bytes, kept_bytes, *times = taken[packing]
-        sizes = [f"{size / 1e6 / hours(rows):.1f}" for size, rows in ((fresh_bytes, fresh), (kept_bytes, kept))]
-        ratios = [f"{value / reference:.2f}" for value, reference in zip(times, base[2:], strict=True)]
-        name = f"zstd {packing.level}" if packing.compression == "zstd" else packing.compression
-        mark = " (default)" if packing == Packing() else ""
-        lines.append(f"| {name} | {packing.chunk_bytes // 1024}{mark} | {' | '.join([*sizes, *ratios])} |")
-    return lines
+        ratios = [value / reference for value, reference in zip(times, base[2:], strict=True)]
+        rows.append({
+            "compression": f"zstd {packing.level}" if packing.compression == "zstd" else packing.compression,
+            "chunk_kib": packing.chunk_bytes // 1024, "is_default": "yes" if packing == Packing() else "no",
+            "new_mb_an_hour": fresh_bytes / 1e6 / hours(fresh), "kept_mb_an_hour": kept_bytes / 1e6 / hours(kept),
+            **dict(zip(("write_ratio", "read_topic_ratio", "seek_ratio"), ratios, strict=True)),
+        })  # fmt: skip
+    return rows
 
 
 def measure_packing(path: Path, fresh: list[Message], kept: list[Message], packing: Packing) -> list[float]:
@@ -176,15 +180,15 @@ def hours(messages: list[Message]) -> float:
     return (messages[-1][1] / SECOND_NS + 1.0) / 3600.0
 
 
-def writing_rows(folder: Path, kept: list[Message]) -> list[str]:
+def writing_rows(folder: Path, kept: list[Message]) -> list[publishing.Row]:
     """Our writer beside the library's."""
     small = [(channels.AGENTS, number * 10**6, bytes(120)) for number in range(100_000)]
-    lines = []
+    rows = []
     for name, messages in (("scenes", kept), ("100 000 messages of 120 bytes", small)):
         library = best_of(lambda messages=messages: write_with_library(folder / "library.mcap", messages))
         ours = best_of(lambda messages=messages: write(folder / "ours.mcap", messages, Packing()))
-        lines.append(f"| {name} | {library / ours:.1f} |")
-    return lines
+        rows.append({"messages": name, "times_faster": library / ours})
+    return rows
 
 
 def generate_source(path: Path, num_bytes: int = 300_000_000) -> None:
@@ -245,8 +249,8 @@ def rewritten(file: object, writer: Writer) -> Iterator[int]:
                 writer.add_metadata(record.name, record.metadata)
 
 
-def combining_rows(folder: Path, kept: list[Message]) -> tuple[list[str], bool]:
-    """A combined file beside a re-write and beside a copy; whether the claims hold."""
+def combining_row(folder: Path, kept: list[Message]) -> publishing.Row:
+    """A combined file beside a re-write and beside a copy."""
     source, side, target = folder / "source.mcap", folder / "side.mcap", folder / "target.mcap"
     write(side, kept, Packing())
     generate_source(source)
@@ -259,9 +263,10 @@ def combining_rows(folder: Path, kept: list[Message]) -> tuple[list[str], bool]:
                 function(source, side, target)
                 walls[number] = min(walls[number], time.perf_counter() - wall)
                 processes[number] = min(processes[number], time.process_time() - process)
-    ratios = walls[2] / walls[1], processes[2] / processes[1], walls[1] / walls[0]
-    line = f"| {source.stat().st_size / 1e6:.0f} | {ratios[0]:.1f} | {ratios[1]:.1f} | {ratios[2]:.2f} |"
-    return [line], ratios[0] >= REWRITE_FACTOR and ratios[2] <= COPY_FACTOR
+    return {
+        "log_mb": source.stat().st_size / 1e6, "rewrite_over_combined_wall": walls[2] / walls[1],
+        "rewrite_over_combined": processes[2] / processes[1], "combined_over_copy_wall": walls[1] / walls[0],
+    }  # fmt: skip
 
 
 def fresh_copy(source: Path, side: Path, target: Path) -> None:
@@ -274,19 +279,18 @@ def combine(source: Path, side: Path, target: Path) -> None:
     write_combined(source, side, target, Packing(), QUIET)
 
 
-def encoding_rows(num_scenes: int = 20) -> tuple[list[str], bool]:
+def encoding_rows(num_scenes: int = 20) -> list[publishing.Row]:
     """The numpy encoder beside the published classes filled point by point."""
     scenes = build_scenes(mission(num_scenes, 1))
-    lines, holds = [], True
+    rows = []
     for vertices in (15, 32, 60):
         style = Style(AGENT_IDS, (0.0, 0.0), EXTENT_M, 0.0, NUM_HYPOTHESES, vertices)
         drawn = [(scene.origin_ns, entities(scene, style)) for scene in scenes]
         ours = best_of(lambda drawn=drawn: [encode_scene(time_ns, "map", found) for time_ns, found in drawn])
         slow = best_of(lambda drawn=drawn: [encode_point_by_point(time_ns, found) for time_ns, found in drawn], 1)
         same = all(SceneUpdate.FromString(encode_scene(t, "map", e)) == point_by_point(t, e) for t, e in drawn[:3])
-        lines.append(f"| {vertices} | {slow / ours:.0f} | {'yes' if same else 'no'} |")
-        holds = holds and same and (vertices < NUM_STEPS or slow >= ENCODING_FACTOR * ours)
-    return lines, holds
+        rows.append({"num_points": vertices, "times_faster": slow / ours, "is_same": "yes" if same else "no"})
+    return rows
 
 
 def encode_point_by_point(time_ns: int, found: list[Entity]) -> bytes:
@@ -332,89 +336,58 @@ def scene_size_mb(folder: Path, fresh: list[Message]) -> float:
 
 
 def main() -> int:
-    """The tables, printed and published; 1 where a claim does not hold."""
+    """Measured, printed and published; 1 where a claim does not hold."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--publish", type=Path, help="folder for log_writing.md")
+    parser.add_argument("--publish", type=Path, metavar="DOCS", help="write numbers and section below this folder")
     arguments = parser.parse_args()
     fresh, kept = side_messages(240, 1, 240), side_messages(20, 20, 400)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         size_mb = scene_size_mb(folder, fresh)
-        packing, writing = packing_rows(folder, fresh, kept), writing_rows(folder, kept)
-        combining, combines = combining_rows(folder, kept)
-    encoding, encodes = encoding_rows()
-    made_with = ", ".join(f"{name} {number}" for name, number in versions().items())
-    text = PAGE.format(
-        versions=made_with, size_mb=size_mb, size_limit_mb=SIZE_LIMIT_MB, packing="\n".join(packing),
-        writing="\n".join(writing), combining="\n".join(combining), encoding="\n".join(encoding),
-        encoding_factor=ENCODING_FACTOR, rewrite_factor=REWRITE_FACTOR, copy_factor=COPY_FACTOR,
-    )  # fmt: skip
-    sys.stdout.write(text)
-    if arguments.publish is not None:
-        write_atomic(arguments.publish / "log_writing.md", text)
-    return 0 if combines and encodes and size_mb <= SIZE_LIMIT_MB else 1
+        tables = {
+            "log_writing_scenes": [{"scene_mb_an_hour": size_mb, "aim_mb_an_hour": SIZE_LIMIT_MB}],
+            "log_writing_encoding": encoding_rows(), "log_writing_packing": packing_rows(folder, fresh, kept),
+            "log_writing_library": writing_rows(folder, kept), "log_writing_combined": [combining_row(folder, kept)],
+        }  # fmt: skip
+    measured = Measurement("log_writing", publishing.facts_of("log_writing"), tables)
+    publishing.publish(measured, section, arguments.publish)
+    return 0 if holds(measured) else 1
 
 
-PAGE = """# Writing logs
+def holds(measured: Measurement) -> bool:
+    """Whether sizes and speeds are as claimed."""
+    (scenes,), (combined,) = measured.rows("scenes"), measured.rows("combined")
+    encoding = measured.rows("encoding")
+    return (
+        scenes["scene_mb_an_hour"] <= SIZE_LIMIT_MB
+        and all(row["is_same"] == "yes" for row in encoding)
+        and encoding[-1]["times_faster"] >= ENCODING_FACTOR
+        and combined["rewrite_over_combined_wall"] >= REWRITE_FACTOR
+        and combined["combined_over_copy_wall"] <= COPY_FACTOR
+    )
 
-    python benchmarks/log_writing.py
 
-Three agents, thirty hypotheses of sixty steps each, a scene a second, drawn and encoded as `cadence export` does with its
-defaults. One thread, CPU, no GPU. Ratios are of the process's own time unless "wall" is said; all were
-taken in one run. MB are 10^6 bytes. Versions: {versions}.
-
-## Scenes
-
-Scenes alone, where *every* scene shows new hypotheses (a window a second, nothing in common with the one before):
-**{size_mb:.1f} MB an hour** (claim: at most {size_limit_mb:g}). Hypotheses that stay for some seconds cost less, see below.
-
-The encoder beside the published protobuf classes filled point by point (claim: at least {encoding_factor:g} times faster for
-all sixty points; every message compared is the same):
-
-| points a hypothesis | times faster | same message |
-|---|---|---|
-{encoding}
-
-With few points, what is left is the work a line group, not a point.
-
-## Chunks
-
-*New*: a window a second, 15 points a hypothesis (the default where windows are that short). *Kept*: a window every twenty
-seconds, 32 points. Both files hold the scenes, the hypotheses without loss, and the numbers for plots; in the first most bytes
-are those hypotheses, float32 that no compressor can shorten. Times are multiples of those of the default packing, for the
-second file: to write it, to read the plot's topic alone, and to find the last scene before a moment, both with the reader of
-`mcap`.
-
-| compression | chunk, KiB | new, MB an hour | kept, MB an hour | write | read one topic | seek |
-|---|---|---|---|---|---|---|
-{packing}
-
-zstd at its first level is the default: on doubles that were rounded, higher levels cost time and win next to nothing, and lz4,
-with its short memory, does not see that a scene resembles the one before. Chunks of 2 MiB: a chunk has to hold many scenes for
-that resemblance to count, and those of large missions take 200 kB each; beyond, files shrink by a few per cent, while the time
-of a seek grows with the chunk, because viewers unpack a whole one to find one message.
-
-## Our writer and the library's
-
-The same messages, checksums and chunk size, zstd at the library's only level, through `mcap.writer.Writer`:
-
-| messages | times faster |
-|---|---|
-{writing}
-
-## Combined files
-
-`export.combined` copies a log byte for byte up to the end of its data and appends our chunks and a common index. Beside it,
-reading and writing all records again with `mcap` (claim: at least {rewrite_factor:g} times slower), and a plain copy of the log
-with `shutil.copyfile` (claim: at most {copy_factor:g} times faster). The log has ten topics, attachments and metadata; our part
-is the second file of above.
-
-| log, MB | re-write / combined, wall | re-write / combined | combined / copy, wall |
-|---|---|---|---|
-{combining}
-
-The stage as a whole also hashes the log, to see that it is the one that was ingested, and the files that it has written.
-"""
+def section(measured: Measurement) -> str:
+    """Sizes by packing, and our writers beside the usual ways."""
+    heads = ["packing", "MB an hour", "write", "read one topic", "seek"]
+    lines = [
+        [f"{row['compression']}, chunks of {row['chunk_kib']} KiB", f"{row['kept_mb_an_hour']:.1f}"]
+        + [f"{row[name]:.1f}" for name in ("write_ratio", "read_topic_ratio", "seek_ratio")]
+        for row in measured.rows("packing")
+        if row["is_default"] == "yes" or (row["compression"], row["chunk_kib"]) in SHOWN
+    ]
+    (scenes,), (combined,) = measured.rows("scenes"), measured.rows("combined")
+    encoding = ", ".join(f"{row['times_faster']:.0f} ({row['num_points']})" for row in measured.rows("encoding"))
+    library = ", ".join(f"{row['times_faster']:.1f} ({row['messages']})" for row in measured.rows("library"))
+    return "\n".join([
+        publishing.table(heads, lines), "",
+        f"* Scenes in which every one shows new hypotheses take {scenes['scene_mb_an_hour']:.1f} MB an hour.",
+        f"* They are encoded so many times as fast as with the published protobuf classes (points a hypothesis): {encoding}.",
+        f"* Our writer is so many times as fast as the library's: {library}.",
+        f"* A combined file of a log of {combined['log_mb']:.0f} MB is written "
+        f"{combined['rewrite_over_combined_wall']:.0f} times as fast as by copying messages, and takes "
+        f"{combined['combined_over_copy_wall']:.1f} times as long as a plain copy.",
+    ])  # fmt: skip
 
 
 if __name__ == "__main__":

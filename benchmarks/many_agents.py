@@ -3,7 +3,7 @@
 A log of ten simulated smugglers is written once. `cadence run` takes it in processes of their own, on two threads, once with
 the bank alone and once with the network; the operating system reports the peak of the resident memory.
 
-    python benchmarks/many_agents.py --publish docs/benchmarks
+    python -m benchmarks.many_agents --publish docs
 """
 
 import argparse
@@ -14,6 +14,9 @@ import sys
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
+
+from benchmarks import publishing
+from benchmarks.publishing import Measurement
 
 LIMIT_GB = 2.0
 NUM_AGENTS, NUM_HYPOTHESES, NUM_WINDOWS = 10, 30, 100
@@ -74,41 +77,34 @@ def _run(words: list[str]) -> int:
 
 
 def main() -> int:
-    """The table, printed and published; 1 where the claim does not hold."""
+    """Measured, printed and published; 1 where the claim does not hold."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--presets", nargs="+", default=list(PRESETS), help="checkpoints; none: the bank alone")
-    parser.add_argument("--publish", type=Path, help="folder for many_agents.md")
+    parser.add_argument("--publish", type=Path, metavar="DOCS", help="write numbers and section below this folder")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         log = simulated(Path(folder))
         peaks = [peak_of(log, preset) for preset in arguments.presets]
     holds = all(peak.bytes < LIMIT_GB * 1e9 and peak.num_windows >= NUM_WINDOWS for peak in peaks)
-    text = HEAD
-    for peak in peaks:
-        name = "bank alone" if peak.preset == "none" else peak.preset
-        counts = f"{peak.num_agents} | {peak.num_windows} | {peak.num_tracks}"
-        text += f"| {name} | {counts} | {peak.bytes / 1e9:.2f} |\n"
-    text += f"\nUnder {LIMIT_GB:g} GB: {'holds' if holds else 'does not hold'}.\n"
-    sys.stdout.write(text)
-    if arguments.publish is not None:
-        from pipeline.files import write_atomic
-
-        write_atomic(arguments.publish / "many_agents.md", text)
+    rows = [
+        {
+            "checkpoint": "bank alone" if peak.preset == "none" else peak.preset, "num_agents": peak.num_agents,
+            "num_windows": peak.num_windows, "num_tracks": peak.num_tracks, "peak_gb": peak.bytes / 1e9,
+        }
+        for peak in peaks
+    ]  # fmt: skip
+    facts = publishing.facts_of("many_agents")
+    facts |= {"num_hypotheses": NUM_HYPOTHESES, "num_threads": NUM_THREADS, "aim_gb": LIMIT_GB}
+    publishing.publish(Measurement("many_agents", facts, {"many_agents": rows}), section, arguments.publish)
     return 0 if holds else 1
 
 
-HEAD = f"""# How much memory do many agents take?
-
-    python benchmarks/many_agents.py
-
-`cadence run` (all stages) on one log of {NUM_AGENTS} simulated smugglers, {NUM_HYPOTHESES} hypotheses a window,
-{NUM_THREADS} threads, no GPU. Peak of the resident memory as the operating system counts it (ru_maxrss), each run in a
-process of its own. GB are 10^9 bytes. Tracks are the rows
-of hypotheses.parquet: a track for each window, hypothesis and agent that was detected within the window.
-
-| checkpoint | agents | windows | tracks | peak, GB |
-|---|---|---|---|---|
-"""
+def section(measured: Measurement) -> str:
+    """Peaks of all checkpoints."""
+    rows = measured.rows()
+    peaks = ", ".join(f"{row['peak_gb']:.2f} GB ({row['checkpoint']})" for row in rows)
+    first, num_hypotheses = rows[0], measured.facts["num_hypotheses"]
+    return f"{first['num_agents']} agents, {num_hypotheses} hypotheses, {first['num_windows']} windows: {peaks}."
 
 
 if __name__ == "__main__":

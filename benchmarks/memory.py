@@ -3,7 +3,7 @@
 Every log is run once in a process of its own, all stages, with the shipped checkpoint; the operating system reports the peak
 of the resident memory. A process that only imports the pipeline shows what the libraries alone take.
 
-    python benchmarks/memory.py --publish docs/benchmarks
+    python -m benchmarks.memory --publish docs
 """
 
 import argparse
@@ -13,6 +13,9 @@ import sys
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
+
+from benchmarks import publishing
+from benchmarks.publishing import Measurement
 
 DATA = Path(__file__).resolve().parents[1].parent / "shared" / "data"
 LIMIT_GB = 1.5
@@ -66,10 +69,11 @@ def peak_of_run(case: Case, log: Path) -> Peak:
         return peak_of([sys.executable, "-c", _COMMAND, "run", str(log), "--out", out, "--quiet", *settings])
 
 
-def rows() -> tuple[list[str], bool]:
-    """Lines of the table, and whether every claim holds."""
-    libraries = peak_of([sys.executable, "-c", _IMPORTS])
-    lines, holds = [f"| libraries alone | - | - | {libraries.bytes / 1e9:.2f} | - |"], True
+def rows_of() -> list[publishing.Row]:
+    """A row a log, after that of a process that only imports the pipeline."""
+    libraries = peak_of([sys.executable, "-c", _IMPORTS]).bytes / 1e9
+    empty = {"file": None, "size_mb": None, "peak_gb": libraries, "aim_gb": None, "settings": None}
+    rows = [{"log": "libraries alone", **empty}]
     for case in CASES:
         log = DATA / case.path
         if not log.is_file():
@@ -78,52 +82,33 @@ def rows() -> tuple[list[str], bool]:
         peak = peak_of_run(case, log)
         if peak.code != 0:
             raise SystemExit(f"memory: cadence run {log} ended with exit code {peak.code}")
-        size = log.stat().st_size
-        claim = "-" if case.limit_gb is None else f"under {case.limit_gb:g}: " + verdict(peak, case.limit_gb)
-        holds = holds and (case.limit_gb is None or peak.bytes < case.limit_gb * 1e9)
-        lines.append(f"| {case.name} | `{log.name}` | {size / 1e6:.1f} | {peak.bytes / 1e9:.2f} | {claim} |")
-    return lines, holds
-
-
-def verdict(peak: Peak, limit_gb: float) -> str:
-    """Whether the claim holds, in a word."""
-    return "holds" if peak.bytes < limit_gb * 1e9 else "does not hold"
+        rows.append({
+            "log": case.name, "file": log.name, "size_mb": log.stat().st_size / 1e6, "peak_gb": peak.bytes / 1e9,
+            "aim_gb": case.limit_gb, "settings": " ".join(case.settings),
+        })  # fmt: skip
+    return rows
 
 
 def main() -> int:
-    """The table, printed and published; 1 where a claim does not hold."""
+    """Measured, printed and published; 1 where a log takes more than it should."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--publish", type=Path, help="folder for memory.md")
+    parser.add_argument("--publish", type=Path, metavar="DOCS", help="write numbers and section below this folder")
     arguments = parser.parse_args()
-    lines, holds = rows()
-    # only now: these bring torch with them, and this process has to be small while children start
-    from pipeline.checkpoints import DEFAULT, checkpoint_hash, find_checkpoint
-    from pipeline.files import write_atomic
-    from pipeline.provenance import versions
+    rows = rows_of()
+    from pipeline.checkpoints import DEFAULT, checkpoint_hash, find_checkpoint  # only now: this process has to be small before
 
-    made_with = ", ".join(f"{name} {number}" for name, number in versions().items())
-    text = HEAD.format(checkpoint=f"{DEFAULT}, {checkpoint_hash(find_checkpoint(DEFAULT))}", versions=made_with)
-    text += "".join(line + "\n" for line in lines)
-    text += "".join(f"\n`{case.path}` was run with `{'`, `'.join(case.settings)}`.\n" for case in CASES if case.settings)
-    sys.stdout.write(text)
-    if arguments.publish is not None:
-        write_atomic(arguments.publish / "memory.md", text)
-    return 0 if holds else 1
+    facts = publishing.facts_of("memory") | {"checkpoint": {DEFAULT: checkpoint_hash(find_checkpoint(DEFAULT))}}
+    publishing.publish(Measurement("memory", facts, {"memory": rows}), section, arguments.publish)
+    return 0 if all(row["aim_gb"] is None or row["peak_gb"] < row["aim_gb"] for row in rows) else 1
 
 
-HEAD = """# How much memory does `cadence run` take?
-
-    python benchmarks/memory.py
-
-Peak of the resident memory of `cadence run` (all stages: ingest, extract, infer, export, report), each log once in a process of
-its own, as the operating system counts it (ru_maxrss); one thread, no GPU. Settings are the defaults but for those named below.
-The first row is a process that only imports the pipeline. GB are 10^9 bytes, MB 10^6.
-
-Checkpoint: {checkpoint}. Versions: {versions}.
-
-| log | file | size of the log, MB | peak, GB | claim, GB |
-|---|---|---|---|---|
-"""
+def section(measured: Measurement) -> str:
+    """Peaks of all logs."""
+    lines = []
+    for row in measured.rows():
+        size = "–" if row["size_mb"] is None else f"{row['size_mb']:.1f}"
+        lines.append([row["log"], size, f"{row['peak_gb']:.2f}"])
+    return publishing.table(["`cadence run`", "log, MB", "peak, GB"], lines)
 
 
 if __name__ == "__main__":

@@ -5,23 +5,25 @@ down: of all recorded episodes those that were where the target was seen, when i
 forecast knows more that does not read the trackers' positions, or what it means not to be seen. Thirty of them, drawn evenly,
 are scored on windows like those of table I, beside the rivals and CADENCE. Scores are kept under --work: a killed run goes on.
 
-    python benchmarks/narco_ceiling.py --publish docs/benchmarks
+    python -m benchmarks.narco_ceiling --publish docs
 """
 
 import argparse
 import functools
-import shlex
 import sys
-from collections.abc import Iterator
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, Self
 
 import numpy as np
 import torch
-from table1 import EVALUATION_SEED
-from table1_page import LATE, MINUTES, NAMES, measure_cells
 
+from benchmarks import publishing
+from benchmarks.leads import relative_lead
+from benchmarks.publishing import Measurement
+from benchmarks.table1 import EVALUATION_SEED
+from benchmarks.table1_page import LATE, NAMES, measure_rows
 from cadence.bank.rows import active_rows, scatter_hypotheses
 from cadence.diffusion.scene import SceneSampling
 from cadence.errors import CadenceError
@@ -31,15 +33,12 @@ from pipeline.checkpoints import checkpoint_hash, find_checkpoint
 from pipeline.episodes.recordings import RecordingsConfig, load_recordings
 from pipeline.estimators.presets import load_forecaster
 from pipeline.estimators.samplings import Samplings
-from pipeline.files import write_atomic
-from pipeline.forecast.leads import relative_lead
 from pipeline.forecast.rivals import FORECAST_RIVALS
 from pipeline.forecast.scores import HORIZONS, EpisodeScores
 from pipeline.forecast.stage import ForecastConfig, ForecastRun, forecast_windows
-from pipeline.forecast.tables import TITLES, line, with_interval
 from pipeline.progress import Progress
 
-SETS = ("low", "high")
+SETS: tuple[Literal["low", "high"], ...] = ("low", "high")
 TRAINING_SEED = 1
 """Of the episodes; that of table I's rivals in narco."""
 NUM_LIBRARY = 300
@@ -138,60 +137,55 @@ def rows_of(name: Literal["low", "high"], setup: Setup) -> tuple[dict[str, Episo
     return found, episodes.scale_m
 
 
-def set_section(name: str, rows: dict[str, EpisodeScores], scale_m: float, seed: int) -> Iterator[str]:
-    """How far behind the best possible every row is, and all measures."""
-    best_title, best = next(iter(rows.items()))
-    yield from (f"## narco {name}", "", f"How far “{best_title}” is ahead in energy score:", "")
-    yield from (line(["of", "mean lead %", "from 60 min on %"]), line(["---"] * 3))
-    for title, scores in rows.items():
-        if scores is not best:
-            leads = [
-                relative_lead([best], [[scores]], "energy_score", "energy_score", horizons, seed, NUM_RESAMPLES)
-                for horizons in (HORIZONS, LATE)
-            ]
-            yield line([title, *(with_interval(100 * item.value, 100 * item.low, 100 * item.high) for item in leads)])
-    yield ""
-    for measure in SHOWN:
-        yield from (f"### {TITLES[measure]}: {name}", "", line(["", *MINUTES]), line(["---"] * 6))
+def tables(found: Mapping[str, tuple[dict[str, EpisodeScores], float]], seed: int) -> dict[str, list[publishing.Row]]:
+    """How far every row is behind the best possible, and all measures."""
+    leads, errors = [], []
+    for name, (rows, scale_m) in found.items():
+        best = next(iter(rows.values()))
         for title, scores in rows.items():
-            yield line([title, *measure_cells(scores, measure, scale_m, seed)])
-        yield ""
+            if scores is not best:
+                lead, late = (
+                    relative_lead([best], [[scores]], "energy_score", "energy_score", horizons, seed, NUM_RESAMPLES)
+                    for horizons in (HORIZONS, LATE)
+                )
+                row = publishing.columns("lead_percent", lead, 100) | publishing.columns("lead_from_60_min_percent", late, 100)
+                leads.append({"set": f"narco {name}", "against": title, **row})
+            for measure in SHOWN:
+                errors += [
+                    {"set": f"narco {name}", "method": title, "measure": measure, **row}
+                    for row in measure_rows(scores, measure, scale_m, seed)
+                ]
+    return {"narco_ceiling_leads": leads, "narco_ceiling_errors": errors}
 
 
-def page(setup: Setup, command: str) -> str:
-    """narco_ceiling.md."""
-    lines = [
-        "# How good a forecast can be in narco", "",
-        f"`{command}`", "",
-        "A smuggler takes one of sixteen ways at one speed, as in the original simulator. *Same so far* knows them: of all",
-        "recorded episodes those that were where the target was seen when it was seen and are still under way, thirty of them",
-        "drawn evenly. No forecast knows more, unless it reads the trackers' positions or what it means not to be seen: its",
-        "lead over a rival is about the most that anybody can have here.",
-        f"{setup.config.num_windows} windows of {setup.num_episodes} episodes a set (seed {EVALUATION_SEED}), over the map's",
-        "longer side; intervals: 95 %, bootstrap over episodes.", "",
-    ]  # fmt: skip
-    for name in SETS:
-        lines += set_section(name, *rows_of(name, setup), setup.config.seed)
-    return "\n".join(lines).rstrip() + "\n"
+def section(measured: Measurement) -> str:
+    """How far the best possible forecast is ahead."""
+    sets = list(dict.fromkeys(row["set"] for row in measured.rows("leads")))
+    lines = []
+    for against in dict.fromkeys(row["against"] for row in measured.rows("leads")):
+        rows = [measured.rows("leads", set=name, against=against)[0] for name in sets]
+        lines.append([against, *(publishing.interval(row, "lead_percent", ".1f") for row in rows)])
+    heads = ["“same so far” ahead of", *(f"{name}, %" for name in sets)]
+    return publishing.table(heads, lines)
 
 
 def main() -> int:
-    """Score what is not kept, and write the page."""
+    """Score what is not kept, and publish."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--work", type=Path, default=Path("runs/narco_ceiling"))
     parser.add_argument("--windows", type=int, default=1000)
     parser.add_argument("--episodes", type=int, default=200, help="to evaluate on")
     parser.add_argument("--training-episodes", type=int, default=15_000)
-    parser.add_argument("--publish", type=Path, help="folder for narco_ceiling.md; without it the page is printed")
+    parser.add_argument("--publish", type=Path, metavar="DOCS", help="write numbers and section below this folder")
     args = parser.parse_args()
     torch.set_num_threads(1)
     config = ForecastConfig(args.windows, scene=SceneSampling(precision="bfloat16"))
     setup = Setup(args.work, args.episodes, args.training_episodes, config, Progress())
-    text = page(setup, shlex.join(["python", "benchmarks/narco_ceiling.py", *sys.argv[1:]]))
-    if args.publish is None:
-        print(text)
-    else:
-        write_atomic(args.publish / "narco_ceiling.md", text)
+    found = {name: rows_of(name, setup) for name in SETS}
+    facts = publishing.facts_of("narco_ceiling") | {
+        "num_windows": args.windows, "num_episodes": args.episodes, "episodes_seed": EVALUATION_SEED,
+    }  # fmt: skip
+    publishing.publish(Measurement("narco_ceiling", facts, tables(found, config.seed)), section, args.publish)
     return 0
 
 

@@ -3,7 +3,9 @@
 Real flight, ship and aircraft tracks (../shared/data) are thinned to bursts of detections, several times with different seeds;
 every estimator is fitted to the detections alone and scored on the same windows against the whole track. One JSON file per
 log, rate, seed and estimator in the work folder: a killed run goes on where it was, and one estimator can be done again alone
-(--again NAME). Tables go to stdout; --publish DIR writes real_logs.md and real_logs.png there.
+(--again NAME).
+
+    python -m benchmarks.real_logs --publish docs
 """
 
 import argparse
@@ -16,6 +18,8 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks import publishing
+from benchmarks.publishing import Measurement
 from cadence.errors import CadenceError
 from cadence.metrics import Interval, bootstrap_ratio
 from cadence.types import Estimator
@@ -133,14 +137,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     results = [_load(options.work, s, name, options.hypotheses) for s in settings for name in options.estimators]
     found = [result for result in results if result is not None]
     rows = table(found)
-    print(as_text(rows))
+    measured = Measurement(
+        "real_logs",
+        publishing.facts_of("real_logs", arguments) | {"num_hypotheses": options.hypotheses, "checkpoint": options.checkpoint},
+        tables(rows, found),
+    )
+    print(publishing.as_csv(measured.rows()), end="")
     if options.publish is not None:
-        options.publish.mkdir(parents=True, exist_ok=True)
-        command = " ".join(["python benchmarks/real_logs.py", *(sys.argv[1:] if arguments is None else arguments)])
-        # these change no number, but --as-it-stands may leave seeds out: each section names its own
-        command = command.replace(f" --work {options.work}", "").replace(" --quiet", "").replace(" --as-it-stands", "")
-        write_atomic(options.publish / "real_logs.md", as_markdown(rows, found, command))
-        draw_chart(rows, options.publish / "real_logs.png")
+        publishing.publish(measured, section, options.publish)
+        draw_chart(rows, options.publish / "images" / "real_logs.png")
     return 0
 
 
@@ -250,87 +255,54 @@ def _row(log: str, rate: float, part: str, name: str, pooled: Mapping[str, Poole
     return Row(log, rate, part, name, means, num_cells, bootstrap_ratio(top, bottom, list(own), rng), better)
 
 
-def as_text(rows: Sequence[Row]) -> str:
-    """A compact table for the terminal."""
-    head = f"{'log':9}{'rate':>5} {'part':8}{'estimator':11}{'energy':>9}{'ratio':>7}  {'interval':15}{'ADE':>8}{'minADE':>8}"
-    lines = [head + f"{'mean':>8}{'in50':>6}{'in90':>6}{'traj.':>8}"]
+def tables(rows: Sequence[Row], results: Sequence[Result]) -> dict[str, list[publishing.Row]]:
+    """All numbers, and how the windows were cut."""
+    numbers = []
     for row in rows:
-        ratio = f"{'–':>7}  {'':15}"
-        if row.ratio is not None:
-            ratio = f"{row.ratio.value:7.3f}  {f'[{row.ratio.low:.3f}, {row.ratio.high:.3f}]':15}"
-        value = {metric: interval.value for metric, interval in row.means.items()}
-        lines.append(
-            f"{row.log:9}{100 * row.rate:4.0f}% {row.part:8}{row.estimator:11}{value['energy_score_m']:9.3f}{ratio}"
-            f"{value['ade_m']:8.2f}{value['min_ade_m']:8.2f}{value['mean_error_m']:8.2f}"
-            f"{value['coverage_50']:6.2f}{value['coverage_90']:6.2f}{value['trajectory_energy_score_m']:8.2f}"
-        )
-    return "\n".join(lines)
+        means = row.means
+        numbers.append({
+            "log": row.log, "detections_percent": round(100 * row.rate), "part": row.part, "estimator": row.estimator,
+            **publishing.columns("energy_m", means["energy_score_m"]), **publishing.columns("ratio", row.ratio),
+            "ratio_to": row.better, **{name: means[name].value for name in ("ade_m", "min_ade_m", "mean_error_m")},
+            **{name: means[name].value for name in ("coverage_50", "coverage_90")},
+            "trajectory_energy_m": means["trajectory_energy_score_m"].value, "num_cells": row.num_cells,
+        })  # fmt: skip
+    return {"real_logs": numbers, "real_logs_windows": _windows(results)}
 
 
-def as_markdown(rows: Sequence[Row], results: Sequence[Result], command: str) -> str:
-    """The page for docs/benchmarks."""
-    seeds = sorted({result.seed for result in results})
-    lines = [
-        "# Real tracks from few detections", "",
-        "A small aircraft in a motion-capture volume (one flight of 198 s), 37 ships (AIS) and 33 fire-fighting aircraft",
-        "(ADS-B), thinned to random bursts of detections, at 5, 12 and 30 % of the samples. Every estimator is fitted to",
-        f"the detections alone, draws {results[0].num_hypotheses} joint samples a window, and is scored on the same windows",
-        "against the whole track.", "",
-        "* past: steps up to the origin, after the first detection of the window; between: those of them with a later",
-        "  detection in the window too; future: steps beyond the origin.",
-        "* energy: energy score (plain form) a step, metres, lower is better; ratio: to the better of the two Kalman",
-        "  smoothers (cv, ou) by the same score, with a paired 95 % bootstrap interval over agents (flight: over ten blocks",
-        "  of time), all seeds of an agent together.",
-        "* in 50, in 90: share of truth within the region of 50 and 90 % highest density (right: 0.50 and 0.90).",
-        "* trajectory: energy score of a whole track, root mean square over its steps.", "",
-        f"Thinning seeds {', '.join(map(str, seeds))}; mean burst 1 s (flight), 20 s (ships), 60 s (aircraft), mean gap",
-        "burst × (1 − rate) / rate.",
-        "", "    " + command, "", "![Energy score over that of the better Kalman smoother](real_logs.png)", "",
-    ]  # fmt: skip
-    for log in dict.fromkeys(row.log for row in rows):
-        lines += _log_section(log, [row for row in rows if row.log == log], [r for r in results if r.log == log])
-    return "\n".join(lines).rstrip() + "\n"
-
-
-def _log_section(log: str, rows: Sequence[Row], results: Sequence[Result]) -> list[str]:
-    lines = [f"## {log.capitalize()}", ""]
-    for rate in dict.fromkeys(row.rate for row in rows):
-        here = [result for result in results if result.rate == rate]
-        steps = sorted({result.step_s for result in here})
-        windows = sorted({result.num_windows for result in here})
+def _windows(results: Sequence[Result]) -> list[publishing.Row]:
+    """Step, number of windows and seeds by log and rate; seeds are those that every estimator has done."""
+    rows = []
+    for log, rate in dict.fromkeys((result.log, result.rate) for result in results):
+        here = [result for result in results if (result.log, result.rate) == (log, rate)]
+        windows = [result.num_windows for result in here]
         per_estimator = ({r.seed for r in here if r.estimator == name} for name in {r.estimator for r in here})
-        seeds = ", ".join(map(str, sorted(set.intersection(*per_estimator))))
-        lines += [
-            f"### {100 * rate:.0f} % detections", "",
-            f"Step {_span(steps)} s, {_span(windows)} windows a seed; seeds {seeds}.", "",
-            "| part | estimator | energy m | ratio | ADE m | minADE m | mean's error | in 50 | in 90 | trajectory m | cells |",
-            "| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |",
-        ]  # fmt: skip
-        for row in rows:
-            if row.rate == rate:
-                lines.append(_markdown_row(row))
-        lines.append("")
-    return lines
+        rows.append({
+            "log": log, "detections_percent": round(100 * rate), "step_s": here[0].step_s, "num_windows_least": min(windows),
+            "num_windows_greatest": max(windows), "seeds": " ".join(map(str, sorted(set.intersection(*per_estimator)))),
+        })  # fmt: skip
+    return rows
 
 
-def _markdown_row(row: Row) -> str:
-    means = row.means
-    energy = means["energy_score_m"]
-    ratio = "–"
-    if row.ratio is not None:
-        ratio = f"{row.ratio.value:.3f} [{row.ratio.low:.3f}, {row.ratio.high:.3f}]"
-        ratio += f" ({row.better})" if row.estimator != row.better else " (itself)"
-    cells = [
-        row.part, row.estimator, f"{energy.value:.3g} [{energy.low:.3g}, {energy.high:.3g}]", ratio,
-        *(f"{means[name].value:.3g}" for name in ("ade_m", "min_ade_m", "mean_error_m")),
-        *(f"{means[name].value:.2f}" for name in ("coverage_50", "coverage_90")),
-        f"{means['trajectory_energy_score_m'].value:.3g}", str(row.num_cells),
-    ]  # fmt: skip
-    return "| " + " | ".join(cells) + " |"
-
-
-def _span(values: Sequence[float]) -> str:
-    return f"{values[0]:g}" if len(values) == 1 else f"{values[0]:g} to {values[-1]:g}"
+def section(measured: Measurement) -> str:
+    """Ratios between detections and beyond the last one, and coverage."""
+    own = measured.rows(estimator=OWN)
+    is_ahead = [row["ratio_high"] < 1.0 for row in own]
+    heads = ["log, detections", "between: CADENCE", "bank", "straight line", "future: CADENCE", "bank", "hold still", "in 90 %"]
+    lines = []
+    for log, percent in dict.fromkeys((row["log"], row["detections_percent"]) for row in own):
+        found = {(r["part"], r["estimator"]): r for r in measured.rows(log=log, detections_percent=percent)}
+        cells = []
+        for part, simple in (("between", "linear"), ("future", "hold")):
+            cells.append(publishing.interval(found[part, OWN], "ratio", ".2f"))
+            cells += [f"{found[part, name]['ratio']:.2f}" for name in ("bank", simple)]
+        shares = [f"{100 * found[part, OWN]['coverage_90']:.0f}" for part in ("between", "future")]
+        lines.append([f"{log}, {percent} %", *cells, f"{', '.join(shares)} %"])
+    text = (
+        "Energy score over that of the better Kalman smoother; CADENCE's interval lies below 1 in "
+        f"{sum(is_ahead)} of {len(own)} cells (log, share of detections, part)."
+    )
+    return f"{text}\n\n{publishing.table(heads, lines)}"
 
 
 def draw_chart(rows: Sequence[Row], path: Path) -> None:
@@ -415,7 +387,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--again", nargs="+", choices=ESTIMATORS, default=[], help="do these again though they have results")
     parser.add_argument("--checkpoint", default=DEFAULT, help="of cadence: a file or a shipped name (default %(default)s)")
     parser.add_argument("--hypotheses", type=int, default=30, help="joint samples a window (default %(default)s)")
-    parser.add_argument("--publish", type=Path, help="write real_logs.md and real_logs.png into this folder")
+    parser.add_argument("--publish", type=Path, metavar="DOCS", help="write numbers, section and picture below this folder")
     parser.add_argument("--as-it-stands", action="store_true", help="run nothing, show and publish the results so far")
     parser.add_argument("--quiet", action="store_true")
     return parser

@@ -5,13 +5,12 @@ steps. Four networks of one size, trained alike: with known and unknown origin, 
 Without attention and with known origin a network is the single-target model, agent by agent. Beside them the shipped network,
 which was trained longer: with known origin, and with detections of unknown origin told apart first (several ways of weight).
 
-    python benchmarks/rendezvous.py --publish docs
+    python -m benchmarks.rendezvous --publish docs
 """
 
 import argparse
 import dataclasses
 import hashlib
-import itertools
 import sys
 import time
 from collections.abc import Callable
@@ -24,6 +23,9 @@ from matplotlib.axes import Axes
 from matplotlib.patches import Circle
 from torch import Tensor
 
+from benchmarks import publishing
+from benchmarks.publishing import Measurement
+from benchmarks.rendezvous_scores import MEETING_M, RADII_M, Scores
 from cadence import metrics
 from cadence.arrays import Float64s, Int64s
 from cadence.association.associate import associate
@@ -37,11 +39,9 @@ from cadence.worlds.rendezvous import RendezvousConfig, simulate_rendezvous, sim
 from cadence.worlds.rendezvous_map import GOALS_M, SITES_M
 from pipeline.checkpoints import checkpoint_hash, find_checkpoint
 from pipeline.estimators.scene import load_scene
-from pipeline.files import write_atomic
 from pipeline.provenance import versions
 
-HORIZONS = (0, 29, 59, 89, 119)
-LABELS = ("0", "30", "60", "90", "120")
+MINUTES = (0, 30, 60, 90, 120)
 NUM_HYPOTHESES = 30
 SAMPLING = SceneSampling(precision="bfloat16")
 APART_M = 4000.0
@@ -53,9 +53,9 @@ STEPS = (40, 160)
 """Windows begin so many minutes after their episode: most groups that meet are on their way then, and meet within two hours."""
 KNOWN, KNOWN_ALONE = "known origin, attention", "known origin, no attention (single-target model)"
 SHIPPED, TOLD_APART = "shipped: known origin, attention", "shipped: unknown origin, told apart first"
-MEETING_M = 1500.0
-"""Half of the least distance of two sites. Truth meets as often at 300 m; hypotheses may be a kilometre off."""
-RADII_M = (500.0, 1000.0, MEETING_M, 2000.0, 3000.0)
+ATTENTION = "known origin, attention over no attention"
+APART = "shipped, unknown over known origin, without order of agents"
+NO_JOINT: publishing.Row = {"joint_energy_km": None, "joint_energy_km_error": None}
 _COLOURS = ("#c8553d", "#2a6f97", "#588157")
 _FOLDER = "benchmarks/checkpoints/rendezvous_"
 
@@ -80,6 +80,9 @@ ROWS = (
 )
 
 
+HAS_NAMES = {row.name: row.has_names for row in ROWS}
+
+
 def main() -> None:
     """Score, print, publish."""
     options = parser().parse_args()
@@ -93,15 +96,15 @@ def main() -> None:
             continue
         begun = time.perf_counter()
         found[row.name] = drawn(row, windows, episodes, options)
-        scores[row.name] = Scores.of(row, found[row.name], windows)
+        scores[row.name] = Scores.of(found[row.name], windows, row.has_names)
         print(f"{row.name}: {time.perf_counter() - begun:.0f} s", file=sys.stderr)
     if options.only is not None:
         return
-    page = render(scores, windows, options)
-    print(page)
+    facts = publishing.facts_of("rendezvous") | {
+        "num_windows": len(windows), "num_episodes": len(windows.episode.unique()), "num_hypotheses": NUM_HYPOTHESES,
+    }  # fmt: skip
+    publishing.publish(Measurement("rendezvous", facts, tables(scores, windows)), section, options.publish)
     if options.publish is not None:
-        (options.publish / "images").mkdir(parents=True, exist_ok=True)
-        write_atomic(options.publish / "benchmarks" / "rendezvous.md", page)
         draw_two(found[SHIPPED], windows).savefig(options.publish / "images" / "rendezvous.png", dpi=110)
 
 
@@ -112,8 +115,10 @@ def parser() -> argparse.ArgumentParser:
     found.add_argument("--episodes", type=int, default=150)
     found.add_argument("--seed", type=int, default=7, help="of the held-out episodes; training has 2026, validation 1")
     found.add_argument("--work", type=Path, default=Path("out/benchmarks/rendezvous"), help="hypotheses are kept there")
-    found.add_argument("--only", action="append", metavar="ROW", help="draw only these rows, for a later run; no page")
-    found.add_argument("--publish", type=Path, metavar="DOCS", help="write the page and the picture below this folder")
+    found.add_argument(
+        "--only", action="append", metavar="ROW", help="draw only these rows, for a later run; nothing is published"
+    )
+    found.add_argument("--publish", type=Path, metavar="DOCS", help="write numbers, section and picture below this folder")
     return found
 
 
@@ -241,147 +246,103 @@ def _latest(detections: Detections) -> Tensor:
     return detections.position_m.reshape(-1, 2)[time_s.argmax()]
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Scores:
-    """What one estimator got, a value a window [B] or a window and horizon [B, H], in metres unless said otherwise.
-
-    at_step, ade, least  error of single hypotheses at the step and on average up to it, and of the best joint hypothesis
-    mean_error           of the mean of the hypotheses
-    joint, joint_set     energy score of all agents' tracks as one vector; the same with the kindest order of agents
-    is_inside            [B, H] share of agents inside the 90 % region
-    meets                [B, R] share of hypotheses in which all agents meet at one site, for the radii `RADII_M`
-    """
-
-    at_step: Tensor
-    ade: Tensor
-    least: Tensor
-    mean_error: Tensor
-    joint: Tensor
-    joint_set: Tensor
-    is_inside: Tensor
-    meets: Float64s
-
-    @staticmethod
-    def of(row: Row, drawn: HypothesisSet, windows: ForecastWindows) -> "Scores":
-        """Where the origin is unknown, the agents of every hypothesis are put in the order that suits the truth best."""
-        truth, weight = windows.truth_m.double(), drawn.weight.double()
-        position = drawn.position_m.double()
-        is_known = torch.ones(truth.shape[:-1], dtype=torch.bool)
-        joint = metrics.trajectory_energy_score(position, weight, truth, is_known)
-        joint_set = torch.stack([set_energy(p, t) for p, t in zip(position, truth, strict=True)])
-        absolute = position + windows.context.datum_m[:, None, None, None]
-        share = np.stack([meets(absolute.numpy(), SITES_M, radius_m).mean(axis=1) for radius_m in RADII_M], axis=1)
-        if not row.has_names:
-            position = torch.stack([arranged(p, t) for p, t in zip(position, truth, strict=True)])
-        at = list(HORIZONS)
-        error = metrics.expected_distance(position, weight, truth).mean(dim=1)  # [B, T], mean over agents
-        upto = error.cumsum(dim=1) / torch.arange(1, truth.shape[2] + 1)
-        least = metrics.min_ade_distance(position, weight, truth, is_known, is_joint=True).mean(dim=1)
-        mean_error = metrics.mean_error(position, weight, truth).mean(dim=1)[:, at]
-        inside = metrics.coverage(position[:, :, :, at], weight, truth[:, :, at], (0.9,))[0].mean(dim=1)
-        return Scores(error[:, at], upto[:, at], least[:, at], mean_error, joint, joint_set, inside, share)
+ERRORS: dict[str, tuple[Callable[[Scores], Tensor], float, bool]] = {
+    "ade_km": (lambda scores: scores.ade, 1e-3, False), "min_ade_km": (lambda scores: scores.least, 1e-3, False),
+    "error_at_step_km": (lambda scores: scores.at_step, 1e-3, False),
+    "mean_error_km": (lambda scores: scores.mean_error, 1e-3, False),
+    "coverage_90": (lambda scores: scores.is_inside, 1.0, True),
+}  # fmt: skip
+"""What is published by horizon: values, their factor, and whether they need to know which agent is which."""
 
 
-def arranged(position: Tensor, truth: Tensor) -> Tensor:
-    """Hypotheses [K, A, T, 2], the agents of each in the order of least error."""
-    orders = torch.tensor(list(itertools.permutations(range(position.shape[1]))))
-    cost = (position[:, :, None] - truth[None, None]).norm(dim=-1).sum(dim=-1)  # [K, drawn, true]
-    total = torch.stack([cost[:, order, torch.arange(len(order))].sum(dim=1) for order in orders], dim=1)
-    best = orders[total.argmin(dim=1)]  # [K, A]
-    return position.gather(1, best[:, :, None, None].expand_as(position))
+def tables(scores: dict[str, Scores], windows: ForecastWindows) -> dict[str, list[publishing.Row]]:
+    """All numbers, means over windows with standard errors by a bootstrap over episodes."""
+    groups, rng = windows.episode.numpy(), np.random.default_rng(0)
 
-
-def set_energy(position: Tensor, truth: Tensor) -> Tensor:
-    """Energy score of hypotheses [K, A, T, 2] whose agents have no order: distances are those of the best matching."""
-    k, a = position.shape[:2]
-    flat = torch.cat([position, truth[None]]).flatten(2)  # [K + 1, A, T * 2]
-    squared = torch.cdist(flat.flatten(0, 1), flat.flatten(0, 1)).square().reshape(k + 1, a, k + 1, a).permute(0, 2, 1, 3)
-    orders = list(itertools.permutations(range(a)))
-    least = torch.stack([squared[:, :, torch.arange(a), list(order)].sum(dim=-1) for order in orders]).amin(dim=0)
-    distance = (least / (a * truth.shape[1])).sqrt()
-    return distance[:k, k].mean() - 0.5 * distance[:k, :k].mean()
-
-
-def render(scores: dict[str, Scores], windows: ForecastWindows, options: argparse.Namespace) -> str:
-    """The page."""
-    groups = windows.episode.numpy()
-    rng = np.random.default_rng(0)
-
-    def cell(values: Tensor | Float64s, scale: float = 1e-3, digits: int = 2) -> str:
+    def mean(column: str, values: Tensor | Float64s, scale: float = 1.0) -> publishing.Row:
         found = metrics.bootstrap_mean(np.asarray(values), groups, rng)
-        error = (found.high - found.low) / 3.92
-        return f"{found.value * scale:.{digits}f} ± {error * scale:.{digits}f}"
+        return {column: scale * found.value, f"{column}_error": scale * (found.high - found.low) / 3.92}
 
-    def table(title: str, value: Callable[[Scores], Tensor], scale: float = 1e-3, names: tuple[str, ...] | None = None) -> str:
-        head = f"### {title}\n\n| | " + " | ".join(f"{label} min" for label in LABELS) + " |\n|---|" + "---|" * len(LABELS)
-        rows = [
-            f"| {name} | " + " | ".join(cell(value(scores[name])[:, h], scale) for h in range(len(LABELS))) + " |"
-            for name in (names or scores)
-        ]
-        return "\n".join([head, *rows])
-
-    with_names = tuple(row.name for row in ROWS if row.has_names)
+    errors = [
+        {"measure": measure, "estimator": name, "horizon_min": minutes, **mean("value", value(of)[:, index], scale)}
+        for measure, (value, scale, needs_names) in ERRORS.items()
+        for name, of in scores.items()
+        if not needs_names or HAS_NAMES[name]
+        for index, minutes in enumerate(MINUTES)
+    ]
     truth_m = (windows.truth_m + windows.context.datum_m[:, None, None]).numpy()
     true_meets = np.stack([meets(truth_m, SITES_M, radius_m) for radius_m in RADII_M], axis=1).astype(float)
     headline = RADII_M.index(MEETING_M)
     truth = true_meets[:, headline]
-    joint = [
-        "| | joint energy score, km | without order of agents, km | share of meetings | Brier score |",
-        "|---|---|---|---|---|",
-    ]
-    for name, s in scores.items():
-        labelled = cell(s.joint) if name in with_names else "–"
-        share = s.meets[:, headline]
-        brier = (share - truth) ** 2
-        joint.append(f"| {name} | {labelled} | {cell(s.joint_set)} | {cell(share, 1)} | {cell(brier, 1, 3)} |")
-    joint.append(f"| truth | | | {cell(truth, 1)} | {cell((truth.mean() - truth) ** 2, 1, 3)} (always the mean share) |")
-    near = ["| | " + " | ".join(f"{radius_m:.0f} m" for radius_m in RADII_M) + " |", "|---|" + "---|" * len(RADII_M)]
+    joint = []
+    for name, of in scores.items():
+        share = of.meets[:, headline]
+        named = mean("joint_energy_km", of.joint, 1e-3) if HAS_NAMES[name] else NO_JOINT
+        sets = mean("unordered_joint_energy_km", of.joint_set, 1e-3)
+        brier = mean("brier_score", (share - truth) ** 2)
+        joint.append({"estimator": name, **named, **sets, **mean("meetings_share", share), **brier})
+    # of truth: the score of whoever always says the mean share
+    guess = mean("brier_score", (truth.mean() - truth) ** 2)
+    joint.append({**dict.fromkeys(joint[0]), "estimator": "truth", **mean("meetings_share", truth), **guess})
     shares = {name: scores[name].meets for name in (SHIPPED, TOLD_APART)} | {"truth": true_meets}
-    near += [f"| {name} | " + " | ".join(cell(column, 1) for column in share.T) + " |" for name, share in shares.items()]
+    radii = [
+        {"estimator": name, "radius_m": radius_m, **mean("meetings_share", column)}
+        for name, share in shares.items()
+        for radius_m, column in zip(RADII_M, share.T, strict=True)
+    ]
     ratio = metrics.bootstrap_ratio(scores[KNOWN].joint, scores[KNOWN_ALONE].joint, groups, rng)
     apart = metrics.bootstrap_ratio(scores[TOLD_APART].joint_set, scores[SHIPPED].joint_set, groups, rng)
-    parts = [
-        "# Several targets at once",
-        f"Made by `python benchmarks/rendezvous.py --windows {options.windows} --episodes {options.episodes} --seed "
-        f"{options.seed} --publish docs` with {versions()['cadence']}; one training seed. {len(windows)} windows of "
-        f"{len(np.unique(groups))} held-out episodes of the world rendezvous, three agents, 30 joint hypotheses, 120 steps of "
-        "a minute. Errors in kilometres, mean over agents, ± standard error by a bootstrap over episodes. Sampler: "
-        f"DPM-Solver++ with six steps (bfloat16), fixed before. Windows begin {STEPS[0]} to {STEPS[1]} minutes after their "
-        "episode. The first four networks have one size and were trained alike (4 500 steps of 64 windows, "
-        "`benchmarks/configs/rendezvous_{base,alone,unknown,unknown_alone}.toml`); the shipped one was trained "
-        "for 25 000 steps more (`cadence/checkpoints/rendezvous.toml`). Where the origin is unknown, "
-        "the agents of each hypothesis are put in the order that suits the truth best, which favours these rows.",
-        table("ADE: mean error of single hypotheses up to the horizon", lambda s: s.ade),
-        table("minADE: error at the step of the best joint hypothesis", lambda s: s.least),
-        table("Error at the step", lambda s: s.at_step),
-        table("Error of the mean at the step", lambda s: s.mean_error),
-        table("Share inside the 90 % region (aim .90)", lambda s: s.is_inside, 1.0, with_names),
-        "## Together\n\n" + "\n".join(joint),
-        f"Joint energy score, attention over none, known origin: {ratio.value:.3f} [{ratio.low:.3f}, {ratio.high:.3f}]. "
-        f"The shipped network, unknown over known origin, without order of agents: {apart.value:.3f} [{apart.low:.3f}, "
-        f"{apart.high:.3f}]. A meeting: all agents within {MEETING_M:.0f} m of one site at one step, by the same rule "
-        "for truth and hypotheses, within the window's two hours.",
-        "### Is the share of meetings right where it is stated?\n\n"
-        + reliability(scores[SHIPPED].meets[:, headline], truth, groups, rng),
-        "### Share of meetings, by how near to a site counts\n\n" + "\n".join(near),
-        "![Two hypotheses of one window, one with a meeting and one without](../images/rendezvous.png)\n\nTwo joint hypotheses "
-        "drawn from the same detections, one that meets and one that goes straight on; thin: all other hypotheses.",
+    ratios = [
+        {"what": what, **publishing.columns("energy_ratio", found)} for what, found in ((ATTENTION, ratio), (APART, apart))
     ]
-    return "\n\n".join(parts) + "\n"
+    return {
+        "rendezvous_errors": errors, "rendezvous_joint": joint, "rendezvous_ratios": ratios,
+        "rendezvous_reliability": reliability(scores[SHIPPED].meets[:, headline], truth, groups, rng),
+        "rendezvous_radii": radii,
+    }  # fmt: skip
 
 
-def reliability(share: Float64s, truth: Float64s, groups: Int64s, rng: np.random.Generator) -> str:
+def reliability(share: Float64s, truth: Float64s, groups: Int64s, rng: np.random.Generator) -> list[publishing.Row]:
     """How often agents met, by how often the hypotheses did."""
-    rows = ["| share of hypotheses that meet | windows | mean share | truth |", "|---|---|---|---|"]
+    rows = []
     for low, high in ((0.0, 0.1), (0.1, 0.4), (0.4, 0.7), (0.7, 0.9), (0.9, 1.01)):
         pick = (share >= low) & (share < high)
         if pick.any():
             found = metrics.bootstrap_mean(truth[pick], groups[pick], rng)
-            rows.append(
-                f"| {low:.1f} to {min(high, 1.0):.1f} | {pick.sum()} | {share[pick].mean():.2f} | "
-                f"{found.value:.2f} [{found.low:.2f}, {found.high:.2f}] |"
-            )
-    return "\n".join(rows)
+            rows.append({
+                "share_of_hypotheses": f"{low:.1f} to {min(high, 1.0):.1f}", "num_windows": int(pick.sum()),
+                "mean_share": share[pick].mean(), **publishing.columns("truth_share", found),
+            })  # fmt: skip
+    return rows
+
+
+def section(measured: Measurement) -> str:
+    """Error, energy score of all tracks together and share of meetings of every network."""
+
+    def cell(row: publishing.Row, column: str) -> str:
+        return "–" if row[column] is None else f"{row[column]:.2f} ± {row[f'{column}_error']:.2f}"
+
+    lines = []
+    for row in measured.rows("joint"):
+        found = measured.rows("errors", measure="ade_km", estimator=row["estimator"], horizon_min=60)
+        error = cell(found[0], "value") if found else "–"
+        lines.append([row["estimator"], error, cell(row, "unordered_joint_energy_km"), cell(row, "meetings_share")])
+    heads = ["", "ADE to 60 min, km", "joint energy score, km", "share of meetings"]
+    attention, apart = (
+        publishing.interval(measured.rows("ratios", what=what)[0], "energy_ratio", ".2f") for what in (ATTENTION, APART)
+    )
+    wide = max(RADII_M)
+    ours, truth = (
+        f"{100 * measured.rows('radii', estimator=name, radius_m=wide)[0]['meetings_share']:.0f} %"
+        for name in (SHIPPED, "truth")
+    )
+    facts = measured.facts
+    text = (
+        f"{facts['num_windows']} windows of {facts['num_episodes']} episodes; ± standard error. Ratio of joint energy scores: "
+        f"attention over none {attention}; told apart over named {apart}. Within {wide / 1000:g} km of a site {ours} of the "
+        f"hypotheses meet, and {truth} of the groups did."
+    )
+    return f"{publishing.table(heads, lines)}\n\n{text}"
 
 
 def draw_two(drawn: HypothesisSet, windows: ForecastWindows) -> plt.Figure:

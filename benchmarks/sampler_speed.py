@@ -6,7 +6,7 @@ in the residual's coordinates, because the shipped network does. Every variant d
 windows of the patrol simulator in one process on one thread, all variants one after the other in every round. A ratio is of the
 processor times of two runs of the same round, so that the machine's speed, and what else it does, go out of it.
 
-    python benchmarks/sampler_speed.py --publish docs/benchmarks
+    python -m benchmarks.sampler_speed --publish docs
 """
 
 import argparse
@@ -22,6 +22,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from benchmarks import publishing
+from benchmarks.publishing import Measurement
 from cadence.bank.bank import BankPosterior
 from cadence.bank.rows import active_rows, scatter_hypotheses
 from cadence.constraints.checker import segments_in_collision
@@ -41,9 +43,7 @@ from pipeline.checkpoints import checkpoint_hash, find_checkpoint
 from pipeline.estimators.fitting import FittingData
 from pipeline.estimators.presets import load_estimator
 from pipeline.estimators.samplings import GeneralSampling, Samplings
-from pipeline.files import write_atomic
 from pipeline.infer.draws import draw_windows
-from pipeline.provenance import versions
 from pipeline.train.missions import mission_of_episode
 from pipeline.windows import GridConfig, MissionWindows, build_windows, plan_grid, truth_on_grid
 
@@ -51,6 +51,9 @@ NUM_STEPS, ITERATIONS, LEARNING_RATE = 100, 8, 1e-2
 POOL = 64
 """Samples of the bank a window from which the steps of DDPM take their fresh noise."""
 CLAIM = 10.0
+DEFAULT, THE_PAPERS, BANK = "default: rotation, 6 steps", "the paper's procedure: DDPM, 100 steps", "the bank alone"
+SHOWN = (DEFAULT, THE_PAPERS, BANK)
+"""Rows of the page."""
 
 Run = Callable[["Case"], HypothesisSet]
 
@@ -281,8 +284,8 @@ def ddpm(name: str, paper: Paper) -> Variant:
 def variants() -> list[Variant]:
     """The default first, the paper's procedure right after it; then what lies between."""
     return [
-        constrained("**default: rotation, 6 steps**", "rotation", 6),
-        ddpm("**the paper's procedure**: DDPM, 100 steps", Paper()),
+        constrained(DEFAULT, "rotation", 6),
+        ddpm(THE_PAPERS, Paper()),
         ddpm("the same without guidance and overwriting", Paper(is_guided=False, overwrite=False)),
         ddpm("the same, detections read once", Paper(encode_each_step=False, is_guided=False, overwrite=False)),
         constrained("DDIM, 12 steps", "ddim", 12),
@@ -291,7 +294,7 @@ def variants() -> list[Variant]:
         constrained("rotation, 12 steps", "rotation", 12),
         constrained("rotation, 3 steps", "rotation", 3),
         Variant("rotation, 6 steps, no guidance, no repair", unconstrained_path),
-        Variant("the bank alone", bank_path),
+        Variant(BANK, bank_path),
     ]
 
 
@@ -340,31 +343,47 @@ def score(drawn: HypothesisSet, case: Case, result: Result) -> None:
     result.hit += (is_hit * drawn.weight).sum(1).tolist()
 
 
-def spread_of(ratios: list[float]) -> str:
-    """Median [min, max]."""
-    return f"{statistics.median(ratios):.1f} [{min(ratios):.1f}, {max(ratios):.1f}]" if ratios else "-"
+def spread_of(column: str, ratios: list[float]) -> publishing.Row:
+    """Median, least and greatest; nothing of no ratios."""
+    values = (statistics.median(ratios), min(ratios), max(ratios)) if ratios else (None, None, None)
+    return dict(zip((column, f"{column}_low", f"{column}_high"), values, strict=True))
 
 
-def table(results: dict[str, Result], chosen: list[Variant], groups: list[int], seed: int) -> list[str]:
+def rows_of(results: dict[str, Result], chosen: list[Variant], groups: list[int], seed: int) -> list[publishing.Row]:
     """A row a variant: how many times the speed of the paper's procedure, and scores over the bank's."""
     paper, bank = results[chosen[1].name], results[chosen[-1].name]
-    lines = []
+    rows = []
     for variant in chosen:
         result = results[variant.name]
         whole = [p / own for p, own in zip(paper.whole_s, result.whole_s, strict=True)]
         part = [p / own for p, own in zip(paper.part_s, result.part_s, strict=True)] if result.part_s else []
-        cells = [spread_of(whole), spread_of(part)]
-        for own, reference in ((result.past, bank.past), (result.future, bank.future)):
+        row = {"sampler": variant.name, **spread_of("speed", whole), **spread_of("network_speed", part)}
+        for name, own, reference in (("past", result.past, bank.past), ("future", result.future, bank.future)):
             ratio = bootstrap_ratio(own, reference, groups, np.random.default_rng(seed))
-            cells.append(f"{ratio.value:.2f} [{ratio.low:.2f}, {ratio.high:.2f}]")
-        lines.append(f"| {variant.name} | " + " | ".join([*cells, f"{100 * statistics.fmean(result.hit):.0f} %"]) + " |")
-    return lines
+            row |= publishing.columns(f"energy_ratio_{name}", ratio)
+        rows.append(row | {"touch_land_percent": 100 * statistics.fmean(result.hit)})
+    return rows
+
+
+def section(measured: Measurement) -> str:
+    """Speed and scores of the default, the paper's procedure and what lies between."""
+    lines = []
+    for name in SHOWN:
+        (row,) = measured.rows(sampler=name)
+        scores = [f"{row[f'energy_ratio_{part}']:.2f}" for part in ("past", "future")]
+        speed = publishing.interval(row, "speed", ".1f")
+        lines.append([name, speed, *scores, f"{row['touch_land_percent']:.0f}"])
+    heads = ["sampler", "speed", "energy score over the bank's: past", "future", "touch land, %"]
+    facts = measured.facts
+    reached = f"{facts['num_pairs_reaching_aim']} of {facts['num_pairs']}"
+    text = f"{facts['num_windows']} windows; in {reached} pairs of runs the default is {CLAIM:.0f} times as fast."
+    return f"{publishing.table(heads, lines)}\n\n{text}"
 
 
 def main() -> int:
-    """The table, printed and published; 1 where the default is not `CLAIM` times as fast as the paper's procedure."""
+    """Measured, printed and published; 1 where the default is not `CLAIM` times as fast as the paper's procedure."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--publish", type=Path, help="folder for sampler_speed.md")
+    parser.add_argument("--publish", type=Path, metavar="DOCS", help="write numbers and section below this folder")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--episodes", type=int, default=6)
     parser.add_argument("--windows", type=int, default=8, help="of each episode")
@@ -385,60 +404,14 @@ def main() -> int:
     groups = [number for number, case in enumerate(cases) for _ in range(case.windows.batch.num_windows)]
     default, paper = results[chosen[0].name], results[chosen[1].name]
     ratios = [p / own for p, own in zip(paper.whole_s, default.whole_s, strict=True)]
-    text = HEAD.format(
-        arguments=f"--seed {arguments.seed} --episodes {arguments.episodes} --windows {arguments.windows} "
-        f"--hypotheses {arguments.hypotheses} --rounds {arguments.rounds}",
-        checkpoint=f"{arguments.checkpoint}, {checkpoint_hash(weights)}",
-        versions=", ".join(f"{name} {number}" for name, number in versions().items()),
-        num_windows=len(groups),
-        num_pairs=len(ratios),
-        num_reached=sum(ratio >= CLAIM for ratio in ratios),
-        ratio=spread_of(ratios),
-        num_obstacles=f"{min(c.obstacles.count for c in cases)} to {max(c.obstacles.count for c in cases)}",
-        **{name: getattr(arguments, name) for name in ("episodes", "windows", "hypotheses", "seed")},
-    )
-    text += "\n".join(table(results, chosen, groups, arguments.seed)) + "\n" + TAIL
-    sys.stdout.write(text)
-    if arguments.publish is not None:
-        write_atomic(arguments.publish / "sampler_speed.md", text)
+    facts = publishing.facts_of("sampler_speed") | {
+        "checkpoint": {arguments.checkpoint: checkpoint_hash(weights)}, "num_windows": len(groups), "num_pairs": len(ratios),
+        "num_pairs_reaching_aim": sum(ratio >= CLAIM for ratio in ratios),
+        "num_obstacles": max(case.obstacles.count for case in cases),
+    }  # fmt: skip
+    tables = {"sampler_speed": rows_of(results, chosen, groups, arguments.seed)}
+    publishing.publish(Measurement("sampler_speed", facts, tables), section, arguments.publish)
     return 0 if statistics.median(ratios) >= CLAIM else 1
-
-
-HEAD = """# How much faster is the default sampler than the paper's procedure?
-
-    python benchmarks/sampler_speed.py {arguments}
-
-**{ratio} times** as many hypotheses a second as the paper's procedure, over the whole path from detections to hypotheses:
-median [least, greatest] of {num_pairs} pairs of runs. The aim is ten times; pairs that reach it: {num_reached}.
-
-Both use the same network (checkpoint {checkpoint}), the same {num_windows} windows
-({windows} of each of {episodes} episodes of the patrol simulator, seed {seed}, {num_obstacles} obstacles),
-{hypotheses} hypotheses a window, the same bank and start. One process, one thread, an episode's windows in one batch; all
-variants run one after the other, and a ratio is of the processor times of two runs of the same round on the same windows.
-Fitting to the log is common to all and not counted. The gate is off: the network moves every hypothesis. Versions:
-{versions}.
-
-The columns: hypotheses a second over those of the paper's procedure, for the whole path (bank, network, guidance, repair) and
-for the network's part alone (with its guidance); energy score over that of the bank's samples up to the origin and after it
-(below one is better than the bank; 95 % interval by bootstrap over episodes); share of hypotheses that touch land.
-
-| variant | speed, whole path | speed, network part | past | future | touch land |
-|---|---|---|---|---|---|
-"""
-
-TAIL = """
-The paper's procedure: 100 steps of DDPM on the cosine schedule; detections read again for every hypothesis at every step;
-algorithm 1 on every posterior mean (Adam, 8 iterations, learning rate 0.01, through autograd; J = 7 * mountain + 50 * mean step
-length, lengths in half map sides); the step at the origin overwritten, clean, where something was detected there. Fresh noise
-is taken from further samples of the bank, as the network was trained; making these is not counted. It ends without repair.
-
-The rows after it take its costs away one by one: first guidance and overwriting, then reading the detections again, at last
-most of the steps. Rows that do not say otherwise are guided on the clean estimate (analytic gradients), repaired and weighted.
-
-What the scores do not say: the network was trained for residuals about the bank and was never meant to be sampled the paper's
-way, and algorithm 1 was made for positions in map units. They say what the faster procedure costs or gains here, not how good
-the paper's model is.
-"""
 
 
 if __name__ == "__main__":

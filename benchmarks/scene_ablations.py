@@ -2,11 +2,11 @@
 
 Variants of the preset are trained on the rebuilt Prison Escape (all three sets) at one small budget and evaluated on the same
 windows: of simulated episodes with a seed of their own, and of episodes of the original simulator, which none has seen.
-Everything is kept under --work: a killed run goes on where it was, and the page is written from whatever is there.
+Everything is kept under --work: a killed run goes on where it was, and what is published is whatever is there.
 
-    python benchmarks/scene_ablations.py --reference ../shared/data/prison_reference --publish docs
-    python benchmarks/scene_ablations.py --only full,no_map --steps 1500 --seeds 0,1
-    python benchmarks/scene_ablations.py --page --publish docs
+    python -m benchmarks.scene_ablations --reference ../shared/data/prison_reference --publish docs
+    python -m benchmarks.scene_ablations --only full,no_map --steps 1500 --seeds 0,1
+    python -m benchmarks.scene_ablations --page --publish docs
 """
 
 import argparse
@@ -21,6 +21,10 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from benchmarks import publishing
+from benchmarks.leads import averaged, relative_lead
+from benchmarks.publishing import Measurement
+from benchmarks.table1_page import MINUTES
 from cadence.diffusion.scene import SceneSampling
 from cadence.diffusion.scene_frame import SceneConfig
 from cadence.errors import InputError
@@ -35,10 +39,9 @@ from pipeline.episodes.pool import EpisodePool, EpisodeSource
 from pipeline.episodes.recordings import RecordingsConfig, load_recordings, read_recordings
 from pipeline.estimators.scene import load_scene
 from pipeline.files import write_atomic
-from pipeline.forecast.leads import averaged, relative_lead
 from pipeline.forecast.scores import HORIZONS, EpisodeScores
 from pipeline.forecast.stage import ForecastConfig, ForecastRun, forecast_windows
-from pipeline.forecast.tables import comparison, line, mean_interval, number, with_interval
+from pipeline.forecast.tables import comparison, mean_interval
 from pipeline.progress import Progress
 from pipeline.train.config import SceneTraining, TrainConfig
 from pipeline.train.scene import train_scene_network
@@ -46,7 +49,7 @@ from pipeline.train.scene import train_scene_network
 SETS = ("low", "med", "high")
 KINDS = ("simulated", "original")
 VALIDATION_SEED, NUM_VALIDATION = 1, 100
-MEASURES = {"energy_score": "energy score", "mean_error": "error of the mean", "ade": "ADE", "coverage_90": "90 % coverage"}
+MEASURES = ("energy_score", "mean_error", "ade", "coverage_90")
 SIDE_M = 2428 * 21.0
 MAP_CELLS = 128
 """Of the true coverage map; a cell is about as large as the blocks on which fugitives plan their routes."""
@@ -214,182 +217,105 @@ def found_scores(setup: Setup, seeds: Sequence[int]) -> tuple[dict[str, Scores],
     return results, counts
 
 
-def cost(own: Scores, full: Scores, kind: str, measure: str) -> Interval | None:
-    """How much worse than the full variant, in per cent of its score: mean over the sets of a kind and the horizons."""
+def lead_over_full(own: Scores, full: Scores, kind: str, measure: str) -> Interval | None:
+    """How far ahead of the full variant, as a share of its score: mean over the sets of a kind and the horizons."""
     keys = [key for key in own if key.startswith(kind) and key in full]
-    if not keys:
+    if not keys or own is full:
         return None
-    lead = relative_lead(
-        [own[key] for key in keys], [[full[key] for key in keys]], measure, measure, HORIZONS, 0, NUM_RESAMPLES
-    )
-    return dataclasses.replace(lead, value=-100 * lead.value, low=-100 * lead.high, high=-100 * lead.low)
+    rivals = [[full[key] for key in keys]]
+    return relative_lead([own[key] for key in keys], rivals, measure, measure, HORIZONS, 0, NUM_RESAMPLES)
 
 
-def summary_table(results: Mapping[str, Scores], names: Sequence[str]) -> Iterator[str]:
-    """A row a variant: what it costs, by measure and kind of episodes, and the mean 90 % coverage."""
-    heads = [f"{MEASURES[m]}, {kind}, %" for m in ("energy_score", "mean_error", "ade") for kind in KINDS]
-    heads += [f"90 % coverage, {kind}, %" for kind in KINDS]
-    yield line(["variant", *heads])
-    yield line(["---"] * (1 + len(heads)))
-    for name in names:
-        own = results[name]
-        costs = [cost(own, results["full"], kind, m) for m in ("energy_score", "mean_error", "ade") for kind in KINDS]
-        cells = ["0" if name == "full" else "–" if c is None else with_interval(c.value, c.low, c.high, 2) for c in costs]
+def cost_rows(results: Mapping[str, Scores]) -> Iterator[publishing.Row]:
+    """What every variant costs against the full one, by kind of episodes, and the mean 90 % coverage."""
+    for name, own in results.items():
         for kind in KINDS:
             values = [own[key].mean("coverage_90").mean() for key in own if key.startswith(kind)]
-            cells.append(number(100 * float(np.mean(values))) if values else "–")
-        yield line([ALL[name].title, *cells])
-    yield ""
+            if values:
+                row: publishing.Row = {"variant": ALL[name].title, "episodes": kind}
+                for measure in ("energy_score", "mean_error", "ade"):
+                    found = lead_over_full(own, results["full"], kind, measure)
+                    row |= publishing.columns(f"{measure}_cost_percent", found, -100)
+                yield row | {"coverage_90_percent": 100 * float(np.mean(values))}
 
 
-def set_tables(key: str, results: Mapping[str, Scores]) -> Iterator[str]:
-    """All measures at all horizons on one set, each with its paired difference from the full variant."""
-    yield from (f"## {key}", "")
-    for measure, title in MEASURES.items():
-        yield from (f"### {title}: {key}", "", line(["variant", "0", "30", "60", "90", "120 min"]), line(["---"] * 6))
-        for name, own in results.items():
-            if key in own:
-                yield line([ALL[name].title, *_cells(own[key], None if name == "full" else results["full"].get(key), measure)])
-        yield ""
-
-
-def _cells(own: EpisodeScores, full: EpisodeScores | None, measure: str) -> Iterator[str]:
-    """Values over the map side with the paired difference in per cent; coverage and its difference in per cent."""
-    is_share = measure.startswith("coverage")
-    for step, value in zip(HORIZONS, own.mean(measure), strict=True):
-        text = number(100 * value if is_share else value / SIDE_M)
-        if full is not None:
-            found = comparison("own", "full", step, {"own": own, "full": full}, 0, NUM_RESAMPLES, measure)
-            triple = np.array([found.ratio, found.ratio_low, found.ratio_high]) - 1.0
-            if is_share:
-                triple = np.array([found.difference_m, found.difference_low_m, found.difference_high_m])
-            text += " ({:+.1f} [{:+.1f}, {:+.1f}])".format(*100 * triple)
-        yield text
-
-
-def curve_points(results: Mapping[str, Scores]) -> dict[str, list[tuple[int, Interval]]]:
-    """By set: training episodes, and the energy score's mean over the horizons, over the map side."""
-    points: dict[str, list[tuple[int, Interval]]] = {}
+def curve_rows(results: Mapping[str, Scores]) -> Iterator[publishing.Row]:
+    """By number of training episodes and set: the energy score's mean over the horizons, over the map side."""
     for name, num in CURVE.items():
         for key, scores in results.get(name, {}).items():
             found = mean_interval(scores.measure("energy_score").mean(axis=1) / SIDE_M, scores, 0, NUM_RESAMPLES)
-            points.setdefault(key, []).append((num, found))
-    return points
+            yield {"num_training_episodes": num, "set": key, **publishing.columns("energy_score", found)}
 
 
-def curve_table(results: Mapping[str, Scores]) -> Iterator[str]:
-    """The curve's points, and its costs against 4 000 episodes."""
-    points = curve_points(results)
-    yield line(["training episodes a set", *points, *(f"against 4 000, {kind}, %" for kind in KINDS)])
-    yield line(["---"] * (1 + len(points) + len(KINDS)))
-    for name, num in CURVE.items():
-        if name in results:
-            at = [dict(found).get(num) for found in points.values()]
-            cells = ["–" if p is None else with_interval(p.value, p.low, p.high) for p in at]
-            costs = [cost(results[name], results["full"], kind, "energy_score") for kind in KINDS]
-            cells += ["0" if name == "full" else "–" if c is None else with_interval(c.value, c.low, c.high, 2) for c in costs]
-            yield line([f"{num:,}".replace(",", " "), *cells])
-    yield ""
+def error_rows(results: Mapping[str, Scores]) -> Iterator[publishing.Row]:
+    """All measures at all horizons, over the map side, with the paired change against the full variant in per cent of it.
+
+    Coverages are in per cent, and so is their change.
+    """
+    for name, scores in results.items():
+        for key, own in scores.items():
+            full = None if name == "full" else results["full"].get(key)
+            for measure in MEASURES:
+                for minutes, row in zip(MINUTES, _error_rows(own, full, measure), strict=True):
+                    yield {"set": key, "variant": ALL[name].title, "measure": measure, "horizon_min": minutes, **row}
 
 
-def draw_curve(results: Mapping[str, Scores], path: Path) -> None:
-    """The curve against 4 000 episodes as a picture: every set, and the mean of a kind with its paired interval."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(7, 4.2), layout="constrained")
-    axes = figure.subplots()
-    names = [name for name in CURVE if name in results]
-    counts = [CURVE[name] for name in names]
-    for color, kind in enumerate(KINDS):
-        for dash, of in zip(("-", "--", ":"), SETS, strict=True):
-            key = f"{kind} {of}"
-            if all(key in results[name] for name in names):
-                values = np.array([results[name][key].mean("energy_score").mean() for name in names])
-                change = 100 * (values / values[names.index("full")] - 1)
-                axes.plot(counts, change, color=f"C{color}", linestyle=dash, linewidth=0.8, alpha=0.7, label=key)
-        costs = [cost(results[name], results["full"], kind, "energy_score") for name in names]
-        if all(item is not None for item in costs):
-            value = np.array([[item.value, item.value - item.low, item.high - item.value] for item in costs if item])
-            bars = np.maximum(value[:, 1:].T, 0.0)
-            axes.errorbar(
-                counts, value[:, 0], bars, color=f"C{color}", marker="o", capsize=3, label=f"{kind}, mean of the sets"
-            )
-    axes.set(xscale="log", xlabel="training episodes a set (simulated)", ylabel="energy score against 4 000 episodes, %")
-    axes.set_xticks(list(CURVE.values()), [str(num) for num in CURVE.values()], minor=False)
-    axes.legend(fontsize=8)
-    axes.grid(alpha=0.3)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=110)
+def _error_rows(own: EpisodeScores, full: EpisodeScores | None, measure: str) -> Iterator[publishing.Row]:
+    is_share = measure.startswith("coverage")
+    for step, value in zip(HORIZONS, own.mean(measure), strict=True):
+        change = None
+        if full is not None:
+            found = comparison("own", "full", step, {"own": own, "full": full}, 0, NUM_RESAMPLES, measure)
+            triple = (found.ratio - 1.0, found.ratio_low - 1.0, found.ratio_high - 1.0)
+            if is_share:
+                triple = (found.difference_m, found.difference_low_m, found.difference_high_m)
+            change = Interval(*triple, 0, 0)
+        yield {"value": 100 * value if is_share else value / SIDE_M, **publishing.columns("change_percent", change, 100)}
 
 
-def page(setup: Setup, results: Mapping[str, Scores], counts: Mapping[str, int], with_picture: bool) -> str:
-    """The page."""
-    missing = [variant.title for name, variant in ALL.items() if name not in results]
-    trainings = " to ".join(str(num) for num in sorted({min(counts.values()), max(counts.values())}))
-    picture = ["![energy score against the number of training episodes](../images/scene_episodes.png)", ""]
-    windows = min((int(scores.count.sum()) for found in results.values() for scores in found.values()), default=0)
-    lines = [
-        "# What the scene preset's parts are worth", "",
-        f"Written by `benchmarks/scene_ablations.py` (--steps {setup.steps} --batch {setup.batch_size}); trainings a "
-        f"variant: {trainings}. Everything but what a row names is as in `full`: all "
-        f"inputs, 4 000 simulated episodes of each of the sets low, med and high of Prison Escape, {setup.steps} steps of "
-        f"{setup.batch_size} windows. The budget is small: it compares variants; none is as good as the shipped checkpoint.",
-        "",
-        f"{windows} windows a set, 30 hypotheses, default sampler with independent noise and without "
-        "obstacles, the known hideout and the trackers told. "
-        "*simulated*: episodes with a seed of their own; *original*: the authors' simulator, which no variant was trained on. "
-        "Brackets: 95 % bootstrap over episodes, paired with `full`; the spread between trainings is not in them.", "",
-        "## Inputs and outputs", "",
-        "How much worse than `full`, mean over sets and horizons (positive: the part is worth something):", "",
-        *summary_table(results, [name for name in VARIANTS if name in results]),
-        "## Training episodes", "", "Energy score over the map side, mean over horizons:", "",
-        *(picture if with_picture else []),
-        *curve_table(results),
-        "Draws of the trajectory library as a further input were not tried: windows would have to be matched against the "
-        "library in every training step. What they add to the forecasts: [library_draws.md](library_draws.md).", "",
-    ]  # fmt: skip
-    lines += [f"Not run yet: {'; '.join(missing)}.", ""] if missing else []
-    lines += [
-        "Below: values over the map side, in round brackets the difference from `full` in per cent of it; coverage and its "
-        "difference in per cent.", "",
-    ]  # fmt: skip
-    for kind in KINDS:
-        for name in SETS:
-            if any(f"{kind} {name}" in found for found in results.values()):
-                lines += set_tables(f"{kind} {name}", results)
-    return "\n".join(lines).rstrip() + "\n"
+def section(measured: Measurement) -> str:
+    """What leaving out a part, and more or fewer training episodes, cost in energy score."""
+    heads = ["worse than the full network", *(f"{kind}, %" for kind in KINDS)]
+    lines = []
+    for variant in dict.fromkeys(row["variant"] for row in measured.rows()):
+        rows = [measured.rows(variant=variant, episodes=kind)[0] for kind in KINDS]
+        if variant != "full":
+            lines.append([variant, *(publishing.interval(row, "energy_score_cost_percent", "z.0f") for row in rows)])
+    return publishing.table(heads, lines)
 
 
 def publish(setup: Setup, seeds: Sequence[int], docs: Path | None) -> None:
-    """Write the page from what is there."""
+    """Publish what is there."""
     results, counts = found_scores(setup, seeds)
     if "full" not in results:
-        setup.progress.note("no page yet: the full variant is not done")
+        setup.progress.note("nothing to publish yet: the full variant is not done")
         return
-    has_curve = sum(name in results for name in CURVE) > 1
-    text = page(setup, results, counts, has_curve)
-    if docs is None:
-        print(text)
-        return
-    write_atomic(docs / "benchmarks" / "scene_ablations.md", text)
-    if has_curve:
-        draw_curve(results, docs / "images" / "scene_episodes.png")
+    facts = publishing.facts_of("scene_ablations") | {
+        "num_trainings": min(counts.values()), "num_windows": setup.num_windows, "num_steps": setup.steps,
+        "batch_size": setup.batch_size, "not_run": [variant.title for name, variant in ALL.items() if name not in results],
+    }  # fmt: skip
+    tables = {
+        "scene_ablations": list(cost_rows(results)),
+        "scene_ablations_curve": list(curve_rows(results)),
+        "scene_ablations_errors": list(error_rows(results)),
+    }
+    publishing.publish(Measurement("scene_ablations", facts, tables), section, docs)
 
 
 def main() -> int:
-    """Run what is not done, variant by variant, and write the page after each."""
+    """Run what is not done, variant by variant, and publish after each."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--work", type=Path, default=Path("runs/ablations"))
     parser.add_argument("--data", type=Path, help="folder of prison_SET_NNN.npz to train on; without it they are simulated")
     parser.add_argument("--reference", type=Path, help="logs of the original simulator (low, med, high), or ref_SET_val.npz")
-    parser.add_argument("--publish", type=Path, help="folder docs; without it the page is printed")
+    parser.add_argument("--publish", type=Path, metavar="DOCS", help="write numbers and section below this folder")
     parser.add_argument("--only", default=",".join(ALL), help="variants, by name")
     parser.add_argument("--steps", type=int, default=1500)
     parser.add_argument("--batch", type=int, default=256)
     parser.add_argument("--seeds", default="0", help="of training")
     parser.add_argument("--windows", type=int, default=500, help="of each set")
     parser.add_argument("--validation", type=int, default=NUM_VALIDATION, help="simulated episodes a set to evaluate on")
-    parser.add_argument("--page", action="store_true", help="only write the page")
+    parser.add_argument("--page", action="store_true", help="train nothing")
     args = parser.parse_args()
     unknown = [name for name in args.only.split(",") if name not in ALL]
     if unknown:

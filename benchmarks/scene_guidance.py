@@ -4,13 +4,12 @@ The prison world's only mountain, its keep-out circle by which the paper counts 
 between states inside it without guidance, with the paper's algorithm 1 and with ours, on windows at random and on windows whose
 true future passes near. Blocks of scores are kept (see scene_samplers.py, whose blocks are shared).
 
-    python benchmarks/scene_guidance.py --publish docs
+    python -m benchmarks.scene_guidance --publish docs
 """
 
 import argparse
 import dataclasses
 import sys
-from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -18,7 +17,10 @@ import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
-from scene_samplers import (
+
+from benchmarks import publishing
+from benchmarks.publishing import Measurement
+from benchmarks.scene_samplers import (
     DDPM,
     DEFAULT,
     PAPER,
@@ -26,10 +28,9 @@ from scene_samplers import (
     SIDE_M,
     THE_PAPERS,
     Task,
-    as_ratio,
     block_of,
     cut_blocks,
-    facts,
+    facts_of,
     load_sets,
     mountain,
     parser,
@@ -39,13 +40,12 @@ from scene_samplers import (
     started,
     truth_scores,
 )  # fmt: skip
-
+from cadence.arrays import Float64s
 from cadence.constraints.checker import states_in_collision
 from cadence.diffusion.scene import SceneModel, SceneSampling
 from cadence.metrics import Interval, bootstrap_ratio
 from cadence.recordings import ForecastWindows, Recordings, choose_windows
 from cadence.worlds import prison_map
-from pipeline.files import write_atomic
 from pipeline.forecast.scores import EpisodeScores
 
 NEAR_CELLS = 250.0
@@ -56,6 +56,10 @@ CLAIM, TOLERANCE = 0.00641, 1.01
 UNGUIDED, GUIDED, BOTH = "unguided", "guidance on the clean estimate", "guidance on the clean estimate, and repair"
 MOVED, REPAIRED = "default without repair", "repair alone"
 MOUNTAIN_ONLY = "algorithm 1, mountain term only"
+TRUTH = "the true tracks"
+SHOWN = (TRUTH, UNGUIDED, DEFAULT, MOUNTAIN_ONLY, THE_PAPERS)
+"""Rows of the page."""
+MOMENTS = ("at random", "near the mountain")
 _INK, _PATH, _SEEN, _ROCK = "#1d2733", "#2a6f97", "#e8a33d", "#8d8478"
 
 
@@ -106,24 +110,33 @@ def share_of(found: EpisodeScores, name: str) -> Interval:
     return bootstrap_ratio(found.share(name), found.count.astype(np.float64), found.episode, np.random.default_rng(0))
 
 
-def table(scores: dict[str, EpisodeScores], truth: EpisodeScores) -> list[str]:
-    """A row a way of guiding."""
-    lines = []
-    for name, found in ({"the true tracks": truth} | scores).items():
-        cells = [_percent(share_of(found, f"{what}_in_obstacles")) for what in ("states", "segments")]
+def rows_of(moments: str, scores: dict[str, EpisodeScores], truth: EpisodeScores) -> list[publishing.Row]:
+    """A row a way of guiding, and one of the true tracks."""
+    rows = []
+    for name, found in ({TRUTH: truth} | scores).items():
+        row: publishing.Row = {"moments": moments, "guidance": name}
+        for what in ("states", "segments"):
+            row |= publishing.columns(f"{what}_inside_percent", share_of(found, f"{what}_in_obstacles"), 100)
         reference = scores[REFERENCE.get(name, UNGUIDED)]
-        if found is truth:
-            cells += ["-"] * 5
-        else:
-            cells += [as_ratio(ratio(found, reference, measure)) for measure in ("ade", "energy_score")]
-            cells += [f"{found.mean(measure).mean() / SIDE_M:.4f}" for measure in ("ade", "energy_score")]
-            cells.append(f"{found.seconds / reference.seconds:.2f}")
-        lines.append(f"| {name} | " + " | ".join(cells) + " |")
-    return lines
+        for column, measure in (("ade_ratio", "ade"), ("energy_ratio", "energy_score")):
+            row |= publishing.columns(column, None if found is truth else ratio(found, reference, measure))
+        means = {measure: found.mean(measure).mean() / SIDE_M for measure in ("ade", "energy_score")}
+        means["time_ratio"] = found.seconds / reference.seconds
+        rows.append(row | (dict.fromkeys(means) if found is truth else means))
+    return rows
 
 
-def _percent(found: Interval) -> str:
-    return f"{100 * found.value:.3f} % [{100 * found.low:.3f}, {100 * found.high:.3f}]"
+def section(measured: Measurement) -> str:
+    """What lies inside the mountain, and what keeping out of it costs."""
+    lines = []
+    for name in SHOWN:
+        far, near = (measured.rows(moments=moments, guidance=name)[0] for moments in MOMENTS)
+        inside = [f"{row['states_inside_percent']:.2f}" for row in (far, near)]
+        ratios = [publishing.interval(far, column, ".3f") for column in ("ade_ratio", "energy_ratio")]
+        lines.append([name, *inside, *ratios])
+    counts = [measured.facts[name] for name in ("num_windows", "num_near_windows")]
+    heads = [f"{counts[0]} moments", "states inside, %", f"in {counts[1]} near it", "ADE ratio", "energy score ratio"]
+    return publishing.table(heads, lines)
 
 
 def draw(trained: dict[str, SceneModel], task: Task) -> Figure:
@@ -155,7 +168,7 @@ def _worst(model: SceneModel, task: Task) -> ForecastWindows:
     return found
 
 
-def _panel(axes: Axes, block: ForecastWindows, drawn: np.typing.Float64s, title: str) -> None:
+def _panel(axes: Axes, block: ForecastWindows, drawn: Float64s, title: str) -> None:
     cell, datum = prison_map.CELL_M, block.context.datum_m[0].numpy()
     axes.add_patch(Circle(prison_map.MOUNTAIN, prison_map.KEEP_OUT, color=_ROCK, alpha=0.6, lw=0))
     for track in (drawn + datum) / cell:
@@ -175,8 +188,8 @@ def _panel(axes: Axes, block: ForecastWindows, drawn: np.typing.Float64s, title:
 
 
 def main() -> int:
-    """The page and its picture; 1 where the default misses the claim."""
-    made = parser("benchmarks/guidance.md and images/guidance.png")
+    """Numbers and a picture; 1 where the default misses the claim."""
+    made = parser()
     made.description = __doc__
     made.formatter_class = argparse.RawDescriptionHelpFormatter
     made.add_argument("--near-windows", type=int, default=150, help="in all sets")
@@ -194,84 +207,22 @@ def main() -> int:
     ]
     models = models_of(trained)
     results = [score_all(task, models) for task in tasks]
-    everywhere, near = ("\n".join(table(scores, truth_scores(task))) for task, scores in zip(tasks, results, strict=True))
-    text = PAGE.format(
-        everywhere=everywhere, near=near, num_near=tasks[1].num_windows, near_cells=NEAR_CELLS, head=HEAD,
-        near_arguments=options.near_windows, headline=_headline(results[0]), **facts(options, tasks[0]),
-    )  # fmt: skip
-    sys.stdout.write(text)
+    rows = [
+        row
+        for moments, task, scores in zip(MOMENTS, tasks, results, strict=True)
+        for row in rows_of(moments, scores, truth_scores(task))
+    ]
+    facts = facts_of("scene_guidance", options, tasks[0]) | {"num_near_windows": tasks[1].num_windows}
+    publishing.publish(Measurement("scene_guidance", facts, {"scene_guidance": rows}), section, options.publish)
     if options.publish is not None:
-        publish(options.publish, text, draw(trained, tasks[1]))
-    return 0 if all(_holds(scores) for scores in results[:1]) else 1
-
-
-def _headline(scores: dict[str, EpisodeScores]) -> str:
-    own = scores[DEFAULT]
-    shares = " and ".join(
-        _percent(share_of(own, f"{what}_in_obstacles")) + f" of the {what}" for what in ("states", "segments")
-    )
-    errors, energy = (as_ratio(ratio(own, scores[UNGUIDED], measure)) for measure in ("ade", "energy_score"))
-    return (
-        f"With the default, {shares} lie inside the mountain, at\n{errors} times the ADE and {energy} times the energy score "
-        "of forecasts that keep out of nothing."
-    )
+        draw(trained, tasks[1]).savefig(options.publish / "images" / "guidance.png", dpi=90)
+    return 0 if _holds(results[0]) else 1
 
 
 def _holds(scores: dict[str, EpisodeScores]) -> bool:
     own = scores[DEFAULT]
     is_clear = all(share_of(own, f"{what}_in_obstacles").value <= CLAIM for what in ("states", "segments"))
     return is_clear and all(ratio(own, scores[UNGUIDED], measure).value <= TOLERANCE for measure in ("ade", "energy_score"))
-
-
-def publish(folder: Path, text: str, figure: Figure) -> None:
-    """Write the page and its picture below `folder`."""
-    write_atomic(folder / "benchmarks" / "guidance.md", text)
-    figure.savefig(folder / "images" / "guidance.png", dpi=90)
-
-
-HEAD = """| | states inside | segments inside | ADE, ratio | energy score, ratio | ADE | energy score | time |
-|---|---|---|---|---|---|---|---|"""
-
-PAGE = """# Do forecasts keep out of the mountain, and what does it cost?
-
-    python benchmarks/scene_guidance.py {arguments} --near-windows {near_arguments}
-
-{headline}
-The aim is at most 0.641 % of both (the paper reports 5 % of the states without and 0.641 % with its guidance), with neither
-score worse than without guidance by more than 1 %.
-
-![Hypotheses of one window without guidance, with the paper's, and with ours](../images/guidance.png)
-
-Windows of the original Prison Escape simulator (three sets, seeds 250 to 299, none of them trained on), {hypotheses}
-hypotheses each, the start known, one thread. Checkpoint: {checkpoint}. Versions: {versions}.
-
-The mountain is the circle of 140 cells by which the paper counts; a segment is the straight way between two states. ADE and
-energy score are means over the horizons 0, 29, 59, 89 and 119 (ADE up to them), over the map's side. Ratios are to the same
-sampler without guidance (`unguided`; for algorithm 1, which needs DDPM, DDPM), paired, with 95 % intervals by bootstrap over
-episodes; so is time (processor time of the whole forecast). The last three rows draw with 100 steps of DDPM.
-
-## Moments at random ({num_windows})
-
-{head}
-{everywhere}
-
-## Moments whose true future passes within {near_cells:g} cells of the mountain's centre ({num_near})
-
-{head}
-{near}
-
-The default moves the finished track: knots inside the mountain are pushed out along the signed distance, as far as the target
-can have come since it was detected; what still crosses is led around (`cadence.constraints.repair`). Guidance on the clean
-estimate does the same at every sampling step, while the track is still uncertain, so that it becomes another one. A track whose
-last detection is inside stays where it was seen.
-
-The true tracks go inside themselves: in the simulator movers turn away at the circle's edge, but follow it up to some 20 cells
-inside. Whoever keeps out of it, as the paper counts, must miss them by that much.
-
-Algorithm 1 works in the sampler's coordinates, here displacements, with the published learning rate and iterations.
-As published it also pulls steps to zero length (weight 50), which slows every target; its row without that term shows what its
-push from the mountain does alone.
-"""
 
 
 if __name__ == "__main__":

@@ -4,7 +4,7 @@ Every variant draws the same number of hypotheses for the same windows of the pr
 blocks of windows in the work folder: a killed run goes on where it was, and more windows can be added. Speeds are ratios of
 processor times on one thread, all variants one after the other in every round, the order reversed in every other round.
 
-    python benchmarks/scene_samplers.py --publish docs/benchmarks
+    python -m benchmarks.scene_samplers --publish docs
 """
 
 import argparse
@@ -20,6 +20,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from benchmarks import publishing
+from benchmarks.publishing import Measurement
+from cadence.arrays import Int64s
 from cadence.constraints.obstacles import Obstacles
 from cadence.diffusion.scene import SceneModel, SceneSampling
 from cadence.errors import CadenceError
@@ -33,7 +36,6 @@ from pipeline.estimators.scene import load_scene
 from pipeline.files import write_atomic
 from pipeline.forecast.scores import HORIZONS, EpisodeScores, score_forecasts, step_quantiles
 from pipeline.progress import Progress
-from pipeline.provenance import versions
 
 DATA = Path(__file__).resolve().parents[1].parent / "shared" / "data" / "prison_reference"
 SETS = ("low", "med", "high")
@@ -75,8 +77,18 @@ class Task:
 
 
 DDPM = "DDPM, 100 steps"
-THE_PAPERS = "**the paper's procedure**"
-DEFAULT = "**default**: mirrored noise, led around the mountain"
+THE_PAPERS = "the paper's procedure"
+DEFAULT = "default: mirrored noise, led around the mountain"
+INDEPENDENT = "default, but for independent noise"
+TUNED = "few steps, tuned weights, otherwise as the default"
+SHOWN = (DEFAULT, INDEPENDENT, TUNED, "DDIM, 5 steps")
+"""Rows of the page."""
+MEASURES = {
+    "energy_score": ("energy_score", SIDE_M), "mean_error": ("mean_error", SIDE_M),
+    "displacement_error": ("displacement_error", SIDE_M), "ade": ("ade", SIDE_M), "min_ade": ("min_ade_at", SIDE_M),
+    "coverage_90": ("coverage_90", 1.0),
+}  # fmt: skip
+"""What is published of a measure, and what it is divided by."""
 
 
 def variants(has_tuned: bool) -> list[Variant]:
@@ -89,8 +101,8 @@ def variants(has_tuned: bool) -> list[Variant]:
     rows.append(Variant("default in bfloat16", rounded))
     if has_tuned:
         rows.append(Variant("few steps, tuned weights", dataclasses.replace(PLAIN, sampler="few"), is_tuned=True))
-        rows.append(Variant("few steps, tuned weights, otherwise as the default", SceneSampling(sampler="few"), is_tuned=True))
-    rows.append(Variant("default, but for independent noise", SceneSampling(is_antithetic=False)))
+        rows.append(Variant(TUNED, SceneSampling(sampler="few"), is_tuned=True))
+    rows.append(Variant(INDEPENDENT, SceneSampling(is_antithetic=False)))
     rows.append(Variant(DEFAULT, SceneSampling()))
     return rows
 
@@ -121,9 +133,7 @@ def cut_blocks(sets: dict[str, Recordings], num_windows: int, size: int, seed: i
     return dict(sorted(blocks.items(), key=lambda item: item[0].rsplit("-", 1)[1]))
 
 
-def block_of(
-    recordings: Recordings, number: int, episode: np.typing.Int64s, step: np.typing.Int64s, seed: int
-) -> ForecastWindows:
+def block_of(recordings: Recordings, number: int, episode: Int64s, step: Int64s, seed: int) -> ForecastWindows:
     """Windows of one set, whose episodes are numbered apart from those of other sets."""
     cut = cut_windows(recordings, episode, step, seed=seed)
     return dataclasses.replace(cut, episode=cut.episode + 10_000 * number)
@@ -206,9 +216,9 @@ def _short(sampling: SceneSampling) -> SceneSampling:
     return dataclasses.replace(sampling, num_steps=1)
 
 
-def spread_of(ratios: Sequence[float]) -> str:
-    """Median [least, greatest]."""
-    return f"{statistics.median(ratios):.1f} [{min(ratios):.1f}, {max(ratios):.1f}]"
+def spread_of(column: str, ratios: Sequence[float]) -> publishing.Row:
+    """Median, least and greatest."""
+    return {column: statistics.median(ratios), f"{column}_low": min(ratios), f"{column}_high": max(ratios)}
 
 
 def ratio(own: EpisodeScores, reference: EpisodeScores, measure: str, seed: int = 0) -> Interval:
@@ -217,46 +227,60 @@ def ratio(own: EpisodeScores, reference: EpisodeScores, measure: str, seed: int 
     return bootstrap_ratio(top, bottom, own.episode, np.random.default_rng(seed))
 
 
-def as_ratio(found: Interval) -> str:
-    """Value [low, high]."""
-    return f"{found.value:.3f} [{found.low:.3f}, {found.high:.3f}]"
-
-
-def horizon_table(title: str, measure: str, scores: dict[str, EpisodeScores], unit: float) -> list[str]:
-    """A measure at every horizon."""
-    lines = [f"\n{title}\n", "| sampler | " + " | ".join(str(h) for h in HORIZONS) + " |", "|---|" + "---|" * len(HORIZONS)]
-    for name, found in scores.items():
-        lines.append(f"| {name} | " + " | ".join(f"{value / unit:.4f}" for value in found.mean(measure)) + " |")
-    return lines
-
-
-def step_table(scores: dict[str, EpisodeScores]) -> list[str]:
-    """Quantiles of the lengths of steps, in cells."""
-    lines = [
-        "| sampler | mean | " + " | ".join(f"{level:.0%}" for level in LEVELS) + " |",
-        "|---|" + "---|" * (1 + len(LEVELS)),
+def horizon_rows(scores: dict[str, EpisodeScores]) -> list[publishing.Row]:
+    """Every measure at every horizon, distances over the map's side."""
+    return [
+        {"measure": name, "sampler": sampler, "horizon_step": step, "value": value / unit}
+        for name, (measure, unit) in MEASURES.items()
+        for sampler, found in scores.items()
+        for step, value in zip(HORIZONS, found.mean(measure), strict=True)
     ]
+
+
+def step_rows(scores: dict[str, EpisodeScores]) -> list[publishing.Row]:
+    """Lengths of steps in cells: the mean, and lengths that a share of the steps does not exceed."""
+    rows = []
     for name, found in scores.items():
         quantiles = step_quantiles(found.steps.sum(axis=0), LEVELS) / prison_map.CELL_M
         mean = found.share("step_length").sum() / found.count.sum() / prison_map.CELL_M
-        lines.append(f"| {name} | {mean:.2f} | " + " | ".join(f"{value:.2f}" for value in quantiles) + " |")
-    return lines
+        shares = {f"quantile_{100 * level:.0f}_cells": value for level, value in zip(LEVELS, quantiles, strict=True)}
+        rows.append({"sampler": name, "mean_cells": mean, **shares})
+    return rows
 
 
-def main_table(scores: dict[str, EpisodeScores], seconds: dict[str, list[float]]) -> list[str]:
-    """A row a variant: speed, and the mean of every measure over the horizons."""
-    lines = []
-    paper = seconds[THE_PAPERS]
+def main_rows(scores: dict[str, EpisodeScores], seconds: dict[str, list[float]]) -> list[publishing.Row]:
+    """A row a variant: speed, and the mean of every measure over the horizons, distances over the map's side."""
+    rows = []
     for name, found in scores.items():
-        speed = spread_of([p / own for p, own in zip(paper, seconds[name], strict=True)])
-        cells = [speed, as_ratio(ratio(found, scores[DDPM], "energy_score"))]
-        cells += [f"{found.mean(m).mean() / SIDE_M:.4f}" for m in ("energy_score", "mean_error", "ade", "min_ade_at")]
-        cells.append(f"{found.mean('coverage_90').mean():.1%}")
-        lines.append(f"| {name} | " + " | ".join(cells) + " |")
-    return lines
+        speed = [paper / own for paper, own in zip(seconds[THE_PAPERS], seconds[name], strict=True)]
+        shown = ("energy_score", "mean_error", "ade", "min_ade")
+        means = {column: found.mean(MEASURES[column][0]).mean() / SIDE_M for column in shown}
+        rows.append({
+            "sampler": name, **spread_of("speed", speed),
+            **publishing.columns("energy_ratio", ratio(found, scores[DDPM], "energy_score")), **means,
+            "coverage_90_percent": 100 * found.mean("coverage_90").mean(),
+        })  # fmt: skip
+    return rows
 
 
-def parser(page: str) -> argparse.ArgumentParser:
+def section(measured: Measurement) -> str:
+    """The claim, and speed and scores of some samplers."""
+    (claim,) = measured.rows("claim")
+    lines = []
+    for name in SHOWN:
+        for row in measured.rows(sampler=name):
+            speed, quality = publishing.interval(row, "speed", ".1f"), publishing.interval(row, "energy_ratio", ".3f")
+            lines.append([name, speed, quality, f"{row['coverage_90_percent']:.0f}"])
+    heads = ["sampler", "speed", "energy score ratio", "in 90 %"]
+    return "\n\n".join([
+        f"On {claim['num_windows']} windows the default draws {publishing.interval(claim, 'speed', '.1f')} times as fast, at "
+        f"{publishing.interval(claim, 'energy_ratio', '.3f')} times the energy score of {DDPM}; on the first "
+        f"{measured.facts['num_windows']}:",
+        publishing.table(heads, lines),
+    ])  # fmt: skip
+
+
+def parser() -> argparse.ArgumentParser:
     """What the scene benchmarks have in common."""
     made = argparse.ArgumentParser(formatter_class=argparse.RawDescriptionHelpFormatter)
     made.add_argument("--checkpoint", default="prison", help="trained by diffusion: a file or a shipped name")
@@ -267,7 +291,7 @@ def parser(page: str) -> argparse.ArgumentParser:
     made.add_argument("--hypotheses", type=int, default=30)
     made.add_argument("--seed", type=int, default=0)
     made.add_argument("--work", type=Path, default=WORK)
-    made.add_argument("--publish", type=Path, help=f"folder for {page}")
+    made.add_argument("--publish", type=Path, metavar="DOCS", help="write numbers and section below this folder")
     return made
 
 
@@ -287,23 +311,19 @@ def started(options: argparse.Namespace) -> dict[str, SceneModel] | None:
     return models
 
 
-def facts(options: argparse.Namespace, task: Task) -> dict[str, object]:
-    """What both pages say of the windows and the network."""
+def facts_of(name: str, options: argparse.Namespace, task: Task) -> dict[str, object]:
+    """How the windows were drawn, and by which networks."""
     names = [options.checkpoint, *([options.tuned] if options.tuned else [])]
-    return {
-        "num_windows": task.num_windows,
+    return publishing.facts_of(name) | {
+        "checkpoints": [checkpoint_hash(find_checkpoint(name)) for name in names], "num_windows": task.num_windows,
         "num_episodes": len({int(e) for block in task.blocks.values() for e in block.episode}),
-        "hypotheses": task.num_hypotheses,
-        "checkpoint": " and ".join(checkpoint_hash(find_checkpoint(name)) for name in names),
-        "versions": ", ".join(f"{name} {number}" for name, number in versions().items()),
-        "arguments": f"--windows {options.windows} --hypotheses {options.hypotheses} --seed {options.seed}"
-        + (f" --tuned {options.tuned}" if options.tuned else ""),
-    }
+        "num_hypotheses": task.num_hypotheses,
+    }  # fmt: skip
 
 
 def main() -> int:
-    """The page, printed and published; 1 where the default misses the claim."""
-    made = parser("scene_samplers.md")
+    """Measured, printed and published; 1 where the default misses the claim."""
+    made = parser()
     made.description = __doc__
     made.add_argument("--rounds", type=int, default=5, help="of the timing")
     made.add_argument("--timed-windows", type=int, default=6)
@@ -326,66 +346,16 @@ def main() -> int:
     claimed = score_all(claim, {name: models[name] for name in (DDPM, DEFAULT)})
     speed = [p / own for p, own in zip(seconds[THE_PAPERS], seconds[DEFAULT], strict=True)]
     quality = ratio(claimed[DEFAULT], claimed[DDPM], "energy_score")
-    text = HEAD.format(
-        speed=spread_of(speed), quality=as_ratio(quality), rounds=options.rounds, timed=options.timed_windows,
-        num_claimed=claim.num_windows, **facts(options, task),
-    )  # fmt: skip
-    lines = main_table(scores, seconds)
-    lines += [STEPS_HEAD, *step_table({"the true tracks": truth_scores(task)} | scores), HORIZONS_HEAD]
-    for title, measure, unit in MEASURES:
-        lines += horizon_table(title, measure, scores, unit)
-    text += "\n".join(lines) + "\n"
-    sys.stdout.write(text)
-    if options.publish is not None:
-        write_atomic(options.publish / "scene_samplers.md", text)
+    found = {**spread_of("speed", speed), **publishing.columns("energy_ratio", quality), "num_windows": claim.num_windows}
+    tables = {
+        "scene_samplers": main_rows(scores, seconds), "scene_samplers_claim": [found],
+        "scene_samplers_steps": step_rows({"the true tracks": truth_scores(task)} | scores),
+        "scene_samplers_horizons": horizon_rows(scores),
+    }  # fmt: skip
+    facts = facts_of("scene_samplers", options, task)
+    facts |= {"num_rounds": options.rounds, "num_timed_windows": options.timed_windows}
+    publishing.publish(Measurement("scene_samplers", facts, tables), section, options.publish)
     return 0 if statistics.median(speed) >= CLAIM and quality.value <= TOLERANCE else 1
-
-
-MEASURES = (
-    ("Energy score", "energy_score", SIDE_M),
-    ("Error of the mean", "mean_error", SIDE_M),
-    ("Displacement error at the step", "displacement_error", SIDE_M),
-    ("ADE up to the step", "ade", SIDE_M),
-    ("minADE at the step", "min_ade_at", SIDE_M),
-    ("Share of the 90 % regions that hold the truth", "coverage_90", 1.0),
-)
-
-HEAD = """# Which sampler draws forecasts fastest without making them worse?
-
-    python benchmarks/scene_samplers.py {arguments} --rounds {rounds} --timed-windows {timed} --claim-windows {num_claimed}
-
-The default draws **{speed} times** as many hypotheses a second as the paper's procedure, at **{quality}** times
-the energy score of 100 steps of DDPM on {num_claimed} windows. The aim is 20 times at no more than 1.02.
-
-Windows: {num_windows} moments of {num_episodes} episodes of the original Prison Escape simulator (three sets, seeds 250 to
-299, none of them trained on), every step equally likely, as many of each set; {hypotheses} hypotheses each, the start known,
-one thread. Checkpoint: {checkpoint}. Versions: {versions}.
-
-Speed: hypotheses a second over those of the paper's procedure, median [least, greatest] of {rounds} rounds of {timed}
-windows; a ratio is of processor times of the same round, and all rows run the same network code. The other columns are means
-over the horizons 0, 29, 59, 89 and 119, distances over the map's side. Ratio: energy score over that of DDPM with 100 steps on
-the same windows, with a 95 % interval by bootstrap over episodes. All rows start from the same noise, but those in which
-every second hypothesis begins with the mirror image of the one before. Rows that do not say otherwise are neither guided
-nor repaired.
-
-The paper's procedure: 100 steps of DDPM on the cosine schedule, detections read again for every hypothesis at every step,
-algorithm 1 on every posterior mean (Adam, 8 iterations, learning rate 0.01, through autograd).
-
-| sampler | speed | ratio of energy scores | energy score | error of the mean | ADE | minADE | 90 % region |
-|---|---|---|---|---|---|---|---|
-"""
-
-STEPS_HEAD = """
-## Lengths of steps
-
-In cells of 21 m: the mean, and lengths that the given share of the steps does not exceed. The simulator moves between whole
-cells, so that its steps are 0 or about 7 to 8 cells; forecasts are straight within four steps.
-"""
-
-HORIZONS_HEAD = """
-## By horizon
-
-Steps 0, 29, 59, 89 and 119; distances over the map's side."""
 
 
 if __name__ == "__main__":

@@ -2,25 +2,24 @@
 
 Evaluation episodes with a seed of their own (fifty a set unless --episodes says more), 2000 random windows, 30 hypotheses,
 errors at 0/30/60/90/120 min over the map side (`pipeline.forecast`). Learned methods are checkpoints that are found by name in
---checkpoints (below); what is not found is named on the page and left out. Scores are kept in blocks of windows under --work: a
-killed run goes on.
+--checkpoints (below); what is not found is named in table1.json and left out. Scores are kept in blocks of windows under
+--work: a killed run goes on.
 
 A checkpoint is NAME.safetensors or NAME/checkpoint.safetensors; of the names METHOD-WORLD-SET-sN, METHOD-WORLD-SET,
 METHOD-WORLD-sN and METHOD-WORLD the first that is found counts, for every training seed N. METHOD is vrnn, grammi_without_mi,
 grammi, paper or cadence, WORLD is prison, narco or reference (which takes those of prison where it has none of its own), SET is
 low, med or high.
 
-    python benchmarks/table1.py --publish docs/benchmarks
-    python benchmarks/table1.py --reference ../shared/data/prison_reference --publish docs/benchmarks
+    python -m benchmarks.table1 --publish docs
+    python -m benchmarks.table1 --reference ../shared/data/prison_reference --publish docs
 
-The paper's preset takes some 20 times as long to sample as CADENCE; --methods leaves it out.
+The paper's preset takes some 20 times as long to sample as CADENCE; --methods leaves it out, and `table1_paper` compares it
+alone.
 """
 
 import argparse
 import dataclasses
 import functools
-import json
-import shlex
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -28,8 +27,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from table1_page import MIXTURES, NAMES, Evaluated, Found, page, record
 
+from benchmarks import publishing
+from benchmarks.leads import averaged
+from benchmarks.publishing import Measurement
+from benchmarks.table1_page import MIXTURES, NAMES, Evaluated, Found, section, tables
 from cadence.diffusion.absolute import AbsoluteSampling
 from cadence.diffusion.scene import SceneSampling
 from cadence.errors import CadenceError, InputError
@@ -40,8 +42,6 @@ from pipeline.config import config_as_dict
 from pipeline.episodes.recordings import RecordingsConfig, load_recordings
 from pipeline.estimators.presets import load_forecaster
 from pipeline.estimators.samplings import Samplings
-from pipeline.files import write_atomic
-from pipeline.forecast.leads import averaged
 from pipeline.forecast.rivals import FORECAST_RIVALS
 from pipeline.forecast.stage import ForecastConfig, ForecastRun, forecast_windows, truth_scores
 from pipeline.progress import Progress
@@ -134,7 +134,7 @@ def evaluate_case(case: Case, setup: Setup, missing: list[str]) -> Evaluated:
     rate = float(recordings.rates().mean())
     if episodes.scale_m is None:
         raise InputError(f"{case.name}: no log states the map's side (Metadata record mission, cell_m or map_side_m)")
-    return Evaluated(rows, episodes.scale_m, len(recordings), setup.config.num_windows, rate, episodes.left_out)
+    return Evaluated(rows, episodes.scale_m, len(recordings), rate, episodes.left_out)
 
 
 def _joined(sources: Sequence[RecordingsConfig], cache: Path, progress: Progress) -> Recordings:
@@ -202,7 +202,7 @@ def budget(training: Mapping[str, Any]) -> dict[str, Any]:
     """Steps, windows seen and processor time of a training, as far as its checkpoint says."""
     seconds = training.get("cpu_seconds")
     hours = None if seconds is None else seconds / 3600.0
-    return {"steps": training.get("steps"), "windows": windows_seen(training), "cpu_hours": hours}
+    return {"steps": training.get("steps"), "num_windows": windows_seen(training), "cpu_hours": hours}
 
 
 def arguments() -> argparse.Namespace:
@@ -221,13 +221,12 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--all-episodes", type=int, default=2000, help='of each set, for "library, all episodes"')
     parser.add_argument("--paper-sampler", choices=("ddim", "dpmpp", "ddpm"), default="ddim", help="10 steps; ddpm: 100")
     parser.add_argument("--precision", choices=("float32", "bfloat16"), default="float32", help="of CADENCE's network")
-    parser.add_argument("--publish", type=Path, help="folder for NAME.md and NAME.json")
-    parser.add_argument("--name", default="table1", help="of the page")
+    parser.add_argument("--publish", type=Path, metavar="DOCS", help="write numbers and section below this folder")
     parser.add_argument("-q", "--quiet", action="store_true")
     return parser.parse_args()
 
 
-def main() -> int:
+def main(name: str = "table1", section: Callable[[Measurement], str] = section) -> int:
     """Evaluate, print and publish."""
     args = arguments()
     sampling = AbsoluteSampling(sampler=args.paper_sampler, inpainting="overwrite")
@@ -242,12 +241,11 @@ def main() -> int:
     for case in cases:
         setup.progress.note(case.name)
         evaluated[case.name] = evaluate_case(case, setup, missing)
-    shown = [word for word in sys.argv[1:] if word not in ("-q", "--quiet")]
-    text = page(evaluated, missing, shlex.join(["python", "benchmarks/table1.py", *shown]), config)
-    sys.stdout.write(text)
-    if args.publish is not None:
-        write_atomic(args.publish / f"{args.name}.json", json.dumps(record(evaluated, missing, config.seed), indent=1) + "\n")
-        write_atomic(args.publish / f"{args.name}.md", text)
+    facts = publishing.facts_of(name) | {
+        "num_windows": args.windows, "num_hypotheses": args.hypotheses, "not_found": missing,
+        "left_out": {key: found.left_out for key, found in evaluated.items()},
+    }  # fmt: skip
+    publishing.publish(Measurement(name, facts, tables(name, evaluated, config.seed)), section, args.publish)
     return 0
 
 

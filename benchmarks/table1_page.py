@@ -1,17 +1,18 @@
-"""The page of `table1.py`: leads over the rivals, cells won and lost, the tables of every set, what the trainings cost."""
+"""What `table1.py` publishes: leads over the rivals, cells won and lost, errors in every set, what the trainings cost."""
 
-import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from pipeline.forecast.leads import count, relative_lead, verdicts
+from benchmarks import publishing
+from benchmarks.leads import count, relative_lead, verdicts
+from benchmarks.publishing import Measurement
 from pipeline.forecast.scores import HORIZONS, MEASURES, SHARES, EpisodeScores
-from pipeline.forecast.stage import ForecastConfig
-from pipeline.forecast.tables import TITLES, line, mean_interval, number, with_interval
+from pipeline.forecast.tables import mean_interval
 
 MIXTURES = ("vrnn", "grammi_without_mi", "grammi")
-MINUTES = ("0", "30", "60", "90", "120 min")
+MINUTES = (0, 30, 60, 90, 120)
+"""What the paper calls the horizons."""
 LATE = HORIZONS[2:]
 NAMES = {
     "vrnn": "VRNN", "grammi_without_mi": "GrAMMI without MI", "grammi": "GrAMMI", "cv": "constant velocity (Kalman)",
@@ -31,6 +32,21 @@ PRINTED = {
                    [.185, .178, .184, .163]],
 }  # fmt: skip
 """Table I as printed (Ye et al., MRS 2023): a row a horizon; VRNN, GrAMMI without MI, GrAMMI, CADENCE."""
+EPISODES = {
+    "our worlds": lambda name: not name.startswith("reference"),
+    "reference": lambda name: name.startswith("reference"),
+}
+"""Kinds of sets, which are compared apart."""
+SHOWN_AS = {"our worlds": "rebuilt worlds", "reference": "recorded"}
+SHOWN = (
+    "the better GrAMMI, energy score; neither is told the hideout",
+    "the better GrAMMI, energy score; CADENCE alone is",
+    "the better GrAMMI, the paper's measure; CADENCE alone is",
+    "VRNN, energy score",
+    "library, energy score",
+    "library, all episodes, energy score",
+)
+"""Rows of the page."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +69,6 @@ class Evaluated:
     rows: dict[str, Found]
     scale_m: float
     num_episodes: int
-    num_windows: int
     detection_rate: float
     left_out: tuple[str, ...]
 
@@ -94,9 +109,9 @@ def row_of(rows: Mapping[str, Found], name: str, goal: bool) -> EpisodeScores | 
     return None if found is None else found.scores
 
 
-def summary_rows(results: Results, seed: int) -> list[dict[str, Any]]:
-    """Mean leads with intervals, cells won, tied and lost, of every duel for which there is a set with both."""
-    rows = []
+def compared(results: Results, episodes: str, seed: int) -> tuple[list[publishing.Row], list[publishing.Row]]:
+    """Mean leads and numbers of cells of every duel for which there is a set with both, and every cell by itself."""
+    leads, cells = [], []
     for duel in duels():
         own, rivals = {}, {name: {} for name in duel.rivals}
         for key, found in results.items():
@@ -113,15 +128,20 @@ def summary_rows(results: Results, seed: int) -> list[dict[str, Any]]:
             relative_lead(list(own.values()), lists, duel.measure, duel.rival_measure, horizons, seed)
             for horizons in (HORIZONS, LATE)
         )
-        cells = [verdicts(own, rivals[name], duel.measure, duel.rival_measure, seed) for name in duel.rivals]
-        verdict = {key: [worst(words) for words in zip(*(found[key] for found in cells), strict=True)] for key in own}
-        total = count(verdict)
-        rows.append({
-            "against": duel.title, "sets": list(own), "lead": [lead.value, lead.low, lead.high],
-            "lead_from_60_min": [late.value, late.low, late.high], "won": total.won, "tied": total.tied, "lost": total.lost,
-            "cells": verdict,
+        words = [verdicts(own, rivals[name], duel.measure, duel.rival_measure, seed) for name in duel.rivals]
+        verdict = {key: [worst(both) for both in zip(*(found[key] for found in words), strict=True)] for key in own}
+        total, what = count(verdict), {"episodes": episodes, "against": duel.title}
+        leads.append({
+            **what, "num_sets": len(own), **publishing.columns("lead_percent", lead, 100),
+            **publishing.columns("lead_from_60_min_percent", late, 100),
+            "won": total.won, "tied": total.tied, "lost": total.lost,
         })  # fmt: skip
-    return rows
+        cells += [
+            {**what, "set": key, "horizon_min": minutes, "verdict": word}
+            for key, row in verdict.items()
+            for minutes, word in zip(MINUTES, row, strict=True)
+        ]
+    return leads, cells
 
 
 def worst(words: Sequence[str]) -> str:
@@ -129,150 +149,108 @@ def worst(words: Sequence[str]) -> str:
     return "lost" if "lost" in words else "tied" if "tied" in words else "won"
 
 
-def summary_table(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """In per cent."""
-    lines = [
-        line(["CADENCE against", "sets", "mean lead %", "from 60 min on %", "cells won", "tied", "lost"]),
-        line(["---"] * 7),
-    ]
-    for row in rows:
-        leads = [with_interval(*(100 * value for value in row[key])) for key in ("lead", "lead_from_60_min")]
-        lines.append(line([row["against"], str(len(row["sets"])), *leads, str(row["won"]), str(row["tied"]), str(row["lost"])]))
-    return [*lines, ""] if rows else ["There is no checkpoint of CADENCE to compare.", ""]
-
-
-def cell_table(rows: Sequence[Mapping[str, Any]], title: str) -> list[str]:
-    """Every cell of one duel by name."""
-    chosen = next((row for row in rows if row["against"].startswith(title)), None)
-    if chosen is None:
-        return []
-    lines = [f"Cells against {chosen['against']}:", "", line(["", *MINUTES]), line(["---"] * 6)]
-    return [*lines, *(line([name, *words]) for name, words in chosen["cells"].items()), ""]
-
-
-def set_section(name: str, found_set: Evaluated, seed: int) -> list[str]:
-    """All blocks of one set."""
-    rows, scale_m, rate = found_set.rows, found_set.scale_m, 100 * found_set.detection_rate
-    lines = [f"## {name}", "", f"{found_set.num_episodes} episodes, detections at {rate:.1f} % of the steps.", ""]
-    lines += [*(f"* left out: {reason}" for reason in found_set.left_out), ""] if found_set.left_out else []
-    for measure in MEASURES:
-        lines += [f"### {TITLES[measure]}: {name}", "", line(["", *MINUTES]), line(["---"] * 6)]
-        for key, found in rows.items():
-            if key != "truth":
-                lines.append(line([label(key, found), *measure_cells(found.scores, measure, scale_m, seed)]))
-        lines.append("")
-    lines += [
-        f"### Steps and obstacles: {name}",
-        "",
-        line(["", "step m", "states in obstacles %", "segments %"]),
-        line(["---"] * 4),
-    ]
-    for key, found in rows.items():
-        total = found.scores.count.sum()
-        step, states, segments = (found.scores.share(item).sum() / total for item in SHARES)
-        lines.append(line([label(key, found), number(step), number(100 * states), number(100 * segments)]))
-    return [*lines, ""]
-
-
-def measure_cells(scores: EpisodeScores, measure: str, scale_m: float, seed: int) -> list[str]:
-    """A measure at every horizon with its interval, over the map side but for coverages."""
-    unit = 1.0 if measure.startswith("coverage") else scale_m
-    return [with_interval(*(value / unit for value in triple)) for triple in triples(scores, measure, seed)]
-
-
-def triples(scores: EpisodeScores, measure: str, seed: int) -> list[tuple[float, float, float]]:
-    """Value, low and high at every horizon."""
-    found = [mean_interval(column, scores, seed, 1000) for column in scores.measure(measure).T]
-    return [(item.value, item.low, item.high) for item in found]
-
-
-def label(key: str, found: Found) -> str:
-    """A row's name."""
-    name, _, goal = key.partition(" ")
-    several = f" (mean of {found.num_trainings} trainings)" if found.num_trainings > 1 else ""
-    return NAMES[name] + (", hideout known" if goal else "") + several
-
-
-def printed_table() -> list[str]:
-    """The paper's own numbers."""
-    heads = [NAMES[name] for name in (*MIXTURES, "cadence")]
-    lines = ["## Printed in the paper", "", "Displacement error over the map side; CADENCE alone was told the hideout.", ""]
-    lines += [line(["set", "horizon", *heads]), line(["---"] * 6)]
-    for name, rows in PRINTED.items():
-        lines += [
-            line([name, f"{minutes} ".split()[0], *(f"{value:.3f}" for value in row)])
-            for minutes, row in zip(MINUTES, rows, strict=True)
-        ]
-    return [*lines, ""]
-
-
-def budget_table(results: Results) -> list[str]:
-    """What every training cost, as far as its checkpoint says."""
-    lines = ["## Budgets", "", line(["set", "method", "checkpoint", "steps", "windows", "CPU hours"]), line(["---"] * 6)]
-    for name, rows in results.items():
-        for key, found in rows.items():
-            for item in found.budgets if not key.endswith("+goal") else ():
-                numbers = ["–" if item[part] is None else f"{item[part]:,}" for part in ("steps", "windows")]
-                lines.append(line([name, NAMES[key], item["checkpoint"], *numbers, number(item["cpu_hours"])]))
-    return [*lines, ""]
-
-
-def as_record(found_set: Evaluated, seed: int) -> dict[str, Any]:
-    """The numbers of a set as JSON: [value, low, high], over the map side but for coverages; shares as they are."""
-    record = {field.name: getattr(found_set, field.name) for field in dataclasses.fields(Evaluated) if field.name != "rows"}
-    rows = {}
-    for key, found in found_set.rows.items():
-        units = {name: 1.0 if name.startswith("coverage") else found_set.scale_m for name in MEASURES}
-        values = {
-            name: [[value / unit for value in triple] for triple in triples(found.scores, name, seed)]
-            for name, unit in units.items()
-        }
-        shares = {name: found.scores.share(name).sum() / found.scores.count.sum() for name in SHARES}
-        rows[key] = {"trainings": found.num_trainings, "budgets": found.budgets, "shares": shares, "values": values}
-    return {**record, "rows": rows}
-
-
-def record(evaluated: Mapping[str, Evaluated], missing: Sequence[str], seed: int) -> dict[str, Any]:
-    """table1.json: every number of the page."""
-    return {
-        "horizons": HORIZONS,
-        "printed": PRINTED,
-        "sets": {name: as_record(found, seed) for name, found in evaluated.items()},
-        "leads": summary_rows({name: found.rows for name, found in evaluated.items()}, seed),
-        "not_found": missing,
-    }
-
-
-def page(evaluated: Mapping[str, Evaluated], missing: Sequence[str], command: str, config: ForecastConfig) -> str:
-    """table1.md."""
-    seed = config.seed
-    lines = [
-        "# The paper's table I, again", "",
-        f"`{command}`", "",
-        f"{config.num_windows} random moments of the evaluation episodes of every set, {config.num_hypotheses} hypotheses",
-        "each. The true start counts as a detection; after its end a target stays where it was. Distances are over the",
-        "map's longer side (2428 cells, 7884 km; the paper does not say what it divides those of narco by). Intervals: 95 %,",
-        "bootstrap over episodes. Mixtures are scored by 30 samples and by the paper's measure, which leaves their sigmas out.",
-        "Samples of CADENCE and of the mixtures come in mirrored pairs, the library's evenly along its weights: no lead comes",
-        "from the way of drawing.",
-        "A cell is won or lost where the interval of the paired difference does not hold zero. A lead is one minus the ratio",
-        "to the rival, or in every cell to the better one of several.", "",
-    ]  # fmt: skip
-    blocks = {
-        "our worlds": lambda name: not name.startswith("reference"),
-        "reference": lambda name: name.startswith("reference"),
-    }
-    for title, is_in in blocks.items():
-        results = {name: found.rows for name, found in evaluated.items() if is_in(name)}
+def tables(name: str, evaluated: Mapping[str, Evaluated], seed: int) -> dict[str, list[publishing.Row]]:
+    """All numbers."""
+    found: dict[str, list[publishing.Row]] = {kind: [] for kind in ("leads", "cells", "errors", "motion", "budgets", "sets")}
+    for episodes, is_in in EPISODES.items():
+        results = {key: item.rows for key, item in evaluated.items() if is_in(key)}
         if results:
-            rows = summary_rows(results, seed)
-            lines += [f"## Leads: {title}", "", *summary_table(rows)]
-            for start in ("the better GrAMMI, 30 samples; neither", "the better GrAMMI, energy score; neither", "VRNN, energy"):
-                lines += cell_table(rows, start)
-    lines += printed_table()
-    for name, found in evaluated.items():
-        lines += set_section(name, found, seed)
-    lines += budget_table({name: found.rows for name, found in evaluated.items()})
-    if missing:
-        lines += ["## Not found", "", *(f"* {item}" for item in missing), ""]
-    return "\n".join(lines).rstrip() + "\n"
+            leads, cells = compared(results, episodes, seed)
+            found["leads"] += leads
+            found["cells"] += cells
+    for key, item in evaluated.items():
+        found["errors"] += error_rows(key, item, seed)
+        found["motion"] += motion_rows(key, item)
+        found["budgets"] += budget_rows(key, item)
+        rate = 100 * item.detection_rate
+        found["sets"].append({"set": key, "num_episodes": item.num_episodes, "detection_rate_percent": rate})
+    found["printed"] = [
+        {"set": key, "horizon_min": minutes, "method": NAMES[method], "displacement_error": value}
+        for key, rows in PRINTED.items()
+        for minutes, row in zip(MINUTES, rows, strict=True)
+        for method, value in zip((*MIXTURES, "cadence"), row, strict=True)
+    ]
+    return {f"{name}_{kind}": rows for kind, rows in found.items() if rows}
+
+
+def error_rows(key: str, item: Evaluated, seed: int) -> Iterator[publishing.Row]:
+    """All measures at all horizons with their intervals, over the map side but for coverages."""
+    for row, found in item.rows.items():
+        if row != "truth":
+            for measure in MEASURES:
+                for values in measure_rows(found.scores, measure, item.scale_m, seed):
+                    yield {"set": key, **of_row(row), "measure": measure, **values}
+
+
+def measure_rows(
+    scores: EpisodeScores, measure: str, scale_m: float, seed: int, num_resamples: int = 1000
+) -> Iterator[publishing.Row]:
+    """A measure by horizon."""
+    unit = 1.0 if measure.startswith("coverage") else scale_m
+    for minutes, column in zip(MINUTES, scores.measure(measure).T, strict=True):
+        found = mean_interval(column / unit, scores, seed, num_resamples)
+        yield {"horizon_min": minutes, **publishing.columns("value", found)}
+
+
+def motion_rows(key: str, item: Evaluated) -> Iterator[publishing.Row]:
+    """Mean length of a step, and what lies in obstacles."""
+    for row, found in item.rows.items():
+        total = found.scores.count.sum()
+        step, states, segments = (found.scores.share(name).sum() / total for name in SHARES)
+        yield {
+            "set": key, **of_row(row), "step_m": step, "states_in_obstacles_percent": 100 * states,
+            "segments_in_obstacles_percent": 100 * segments,
+        }  # fmt: skip
+
+
+def budget_rows(key: str, item: Evaluated) -> Iterator[publishing.Row]:
+    """What every training cost, as far as its checkpoint says."""
+    for row, found in item.rows.items():
+        if not row.endswith("+goal"):
+            yield from ({"set": key, "method": NAMES[row], **budget} for budget in found.budgets)
+
+
+def of_row(row: str) -> publishing.Row:
+    """Which method it is, and whether it was told the hideout."""
+    name, _, goal = row.partition(" ")
+    return {"method": NAMES[name], "is_hideout_told": "yes" if goal else "no"}
+
+
+def section(measured: Measurement) -> str:
+    """Leads over the main rivals, how often the truth is in the region, and what the trainings cost."""
+    words = []
+    for told in ("no", "yes"):
+        rows = measured.rows("errors", method=NAMES["cadence"], measure="coverage_90", is_hideout_told=told)
+        shares = [100 * row["value"] for row in rows]
+        words.append(f"{min(shares):.0f} to {max(shares):.0f} %")
+    budgets = budget_words(measured, ("prison low", "narco low"), ("cadence", "grammi", "vrnn"))
+    text = (
+        f"{measured.facts['num_windows']} moments a set. CADENCE's 90 % region holds {words[0]} of the truth by set and "
+        f"horizon, {words[1]} with the hideout told. Trained on {budgets}."
+    )
+    return f"{lead_table(measured, SHOWN)}\n\n{text}"
+
+
+def lead_table(measured: Measurement, shown: Sequence[str]) -> str:
+    """Mean lead, and cells won, tied and lost; dashes where nothing was compared."""
+    heads = ["CADENCE ahead of", *(f"{name}: {what}" for name in SHOWN_AS.values() for what in ("%", "cells"))]
+    lines = []
+    for against in shown:
+        cells = []
+        for episodes in SHOWN_AS:
+            rows = measured.rows("leads", episodes=episodes, against=against)
+            for row in rows:
+                cells += [publishing.interval(row, "lead_percent", ".0f"), f"{row['won']}/{row['tied']}/{row['lost']}"]
+            cells += [] if rows else ["–"] * 2
+        lines.append([against.removesuffix("; neither is told the hideout"), *cells])
+    return publishing.table(heads, lines)
+
+
+def budget_words(measured: Measurement, sets: Sequence[str], methods: Sequence[str]) -> str:
+    """Windows and processor time of trainings, set by set."""
+    parts = []
+    for key in sets:
+        found = [row for method in methods for row in measured.rows("budgets", set=key, method=NAMES[method])]
+        words = [f"{row['method']} {row['num_windows'] / 1e6:.1f} ({row['cpu_hours']:.1f} h)" for row in found]
+        parts.append(f"{key.split()[0]} {', '.join(words)}")
+    return "; ".join(parts) + " million windows (CPU hours)"

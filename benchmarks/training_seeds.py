@@ -2,17 +2,16 @@
 
 Every method is trained on the episodes of one set alone and sees as many windows as every other. The settings are those of the
 shipped trainings (cadence/checkpoints, benchmarks/configs), but for sources, seeds and the number of steps: that of the shipped
-ones would take some 14 hours of a core. Trainings and scores are kept under --work: a killed run goes on, and the page is
-written from whatever is there.
+ones would take some 14 hours of a core. Trainings and scores are kept under --work: a killed run goes on, and what is published
+is whatever is there.
 
-    python benchmarks/training_seeds.py --publish docs/benchmarks
-    python benchmarks/training_seeds.py --worlds narco --seeds 0,1
+    python -m benchmarks.training_seeds --publish docs
+    python -m benchmarks.training_seeds --worlds narco --seeds 0,1
 """
 
 import argparse
 import dataclasses
 import functools
-import shlex
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -21,9 +20,12 @@ from typing import Literal
 
 import numpy as np
 import torch
-from table1 import EVALUATION_SEED
-from table1_page import LATE, MINUTES, NAMES, measure_cells, worst
 
+from benchmarks import publishing
+from benchmarks.leads import averaged, count, relative_lead, verdicts
+from benchmarks.publishing import Measurement
+from benchmarks.table1 import EVALUATION_SEED
+from benchmarks.table1_page import LATE, NAMES, measure_rows, worst
 from cadence.errors import CadenceError
 from cadence.recordings import Recordings
 from cadence.training.place import untrained_network
@@ -33,11 +35,8 @@ from pipeline.episodes.pool import EpisodePool, EpisodeSource
 from pipeline.episodes.recordings import RecordingsConfig, load_recordings
 from pipeline.estimators.presets import load_forecaster
 from pipeline.estimators.samplings import Samplings
-from pipeline.files import write_atomic
-from pipeline.forecast.leads import averaged, count, relative_lead, verdicts
 from pipeline.forecast.scores import HORIZONS, EpisodeScores
 from pipeline.forecast.stage import ForecastConfig, ForecastRun, forecast_windows
-from pipeline.forecast.tables import TITLES, line, number, with_interval
 from pipeline.progress import Progress
 from pipeline.train.config import TrainConfig
 from pipeline.train.rivals import train_rival
@@ -156,99 +155,102 @@ def scores_of(world: World, run: ForecastRun, setup: Setup) -> Scores:
     return found
 
 
-def leads(own: EpisodeScores, rivals: Sequence[EpisodeScores], duel: str) -> list[str]:
-    """Cells of a row: the mean lead over the better rival, that from 60 min on, and the cells won, tied and lost."""
-    cells = []
-    for horizons in (HORIZONS, LATE):
+def leads(own: EpisodeScores, rivals: Sequence[EpisodeScores], duel: str) -> publishing.Row:
+    """The mean lead over the better rival, that from 60 min on, and the cells won, tied and lost."""
+    row: publishing.Row = {}
+    for column, horizons in (("lead_percent", HORIZONS), ("lead_from_60_min_percent", LATE)):
         found = relative_lead([own], [[rival] for rival in rivals], *DUELS[duel], horizons, BOOTSTRAP_SEED, NUM_RESAMPLES)
-        cells.append(with_interval(100 * found.value, 100 * found.low, 100 * found.high))
+        row |= publishing.columns(column, found, 100)
     words = [verdicts({"": own}, {"": rival}, *DUELS[duel], BOOTSTRAP_SEED)[""] for rival in rivals]
     total = count({"": [worst(both) for both in zip(*words, strict=True)]})
-    return [*cells, f"{total.won} / {total.tied} / {total.lost}"]
+    return row | {"won": total.won, "tied": total.tied, "lost": total.lost}
 
 
-def lead_table(scores: Scores) -> Iterator[str]:
+def lead_rows(key: str, scores: Scores) -> Iterator[publishing.Row]:
     """CADENCE against the better GrAMMI, seed by seed and for the mean over the seeds."""
     if any(name not in scores for name in ("cadence", *GRAMMIS)):
         return
     seeds = sorted(set(scores["cadence"]) & set(scores[GRAMMIS[0]]) & set(scores[GRAMMIS[1]]))
-    yield line(["measure", "seeds", "mean lead %", "from 60 min on %", "cells won / tied / lost"])
-    yield line(["---"] * 5)
+    means = {name: averaged([scores[name][seed] for seed in seeds]) for name in ("cadence", *GRAMMIS)}
     for duel in DUELS:
         for seed in seeds:
             rivals = [scores[name][seed] for name in GRAMMIS]
-            yield line([duel, str(seed), *leads(scores["cadence"][seed], rivals, duel)])
-        means = {name: averaged([scores[name][seed] for seed in seeds]) for name in ("cadence", *GRAMMIS)}
-        yield line([duel, f"mean of {len(seeds)}", *leads(means["cadence"], [means[name] for name in GRAMMIS], duel)])
-    yield ""
-    pairs_of_rivals = [[[scores[name][seed]] for name in GRAMMIS] for seed in seeds]
+            yield {"set": key, "measure": duel, "seed": seed, **leads(scores["cadence"][seed], rivals, duel)}
+        yield {
+            "set": key, "measure": duel, "seed": "mean", **leads(means["cadence"], [means[name] for name in GRAMMIS], duel)
+        }  # fmt: skip
+
+
+def pair_row(key: str, scores: Scores) -> publishing.Row:
+    """The least and the greatest mean lead in energy score over all pairs of a seed of CADENCE with one of the GrAMMIs."""
+    seeds = sorted(set(scores[GRAMMIS[0]]) & set(scores[GRAMMIS[1]]))
     energy = DUELS["energy score"]
     pairs = [
-        relative_lead([own], rival, *energy, HORIZONS, BOOTSTRAP_SEED, 1).value
+        100 * relative_lead([own], [[scores[name][seed]] for name in GRAMMIS], *energy, HORIZONS, BOOTSTRAP_SEED, 1).value
         for own in scores["cadence"].values()
-        for rival in pairs_of_rivals
+        for seed in seeds
     ]
-    yield (
-        f"Over all {len(pairs)} pairs of a seed of CADENCE with one of the GrAMMIs the mean lead in energy score lies between "
-        f"{100 * min(pairs):.1f} and {100 * max(pairs):.1f} %."
-    )
-    yield ""
+    return {
+        "set": key, "num_pairs": len(pairs), "lead_percent_least": min(pairs), "lead_percent_greatest": max(pairs)
+    }  # fmt: skip
 
 
-def spread_tables(scores: Scores, scale_m: float) -> Iterator[str]:
+def error_rows(key: str, scores: Scores, scale_m: float) -> Iterator[publishing.Row]:
     """Every measure: the mean over the seeds with its interval over the episodes, and the deviation between seeds."""
-    for measure in SHOWN:
-        unit = 1.0 if measure.startswith("coverage") else scale_m
-        yield from (f"### {TITLES[measure]}", "", line(["", *MINUTES]), line(["---"] * 6))
-        for method, found in scores.items():
+    for method, found in scores.items():
+        for measure in SHOWN:
             if not all(np.isfinite(score.measure(measure)).all() for score in found.values()):
                 continue
+            unit = 1.0 if measure.startswith("coverage") else scale_m
             values = np.array([score.mean(measure) for score in found.values()]) / unit
-            spread = values.std(axis=0, ddof=1) if len(values) > 1 else [None] * values.shape[1]
-            means = measure_cells(averaged(list(found.values())), measure, scale_m, BOOTSTRAP_SEED)
-            both = [f"{mean} ± {number(sd, 2)}" for mean, sd in zip(means, spread, strict=True)]
-            yield line([f"{NAMES[method]} ({len(found)})", *both])
-        yield ""
+            deviations = values.std(axis=0, ddof=1) if len(values) > 1 else np.full(values.shape[1], np.nan)
+            rows = measure_rows(averaged(list(found.values())), measure, scale_m, BOOTSTRAP_SEED)
+            for row, deviation in zip(rows, deviations, strict=True):
+                yield {
+                    "set": key, "method": NAMES[method], "num_seeds": len(found), "measure": measure, **row,
+                    "deviation_of_seeds": deviation,
+                }  # fmt: skip
 
 
-def budget_table(world: World, scores: Scores, setup: Setup) -> Iterator[str]:
+def budget_rows(key: str, world: World, scores: Scores, setup: Setup) -> Iterator[publishing.Row]:
     """What the trainings cost."""
-    yield line(["method", "seed", "steps", "windows", "CPU hours"])
-    yield line(["---"] * 5)
     for method, found in scores.items():
         for seed in found:
-            info = read_info(setup.training(method, world, seed) / "checkpoint.safetensors")
-            seconds = info.training.get("cpu_seconds")
-            numbers = [f"{value:,}" if value else "–" for value in (info.training.get("steps"), windows_seen(info.training))]
-            hours = number(None if seconds is None else seconds / 3600.0, 2)
-            yield line([NAMES[method], str(seed), *numbers, hours])
-    yield ""
+            training = read_info(setup.training(method, world, seed) / "checkpoint.safetensors").training
+            seconds = training.get("cpu_seconds")
+            yield {
+                "set": key, "method": NAMES[method], "seed": seed, "steps": training.get("steps"),
+                "num_windows": windows_seen(training), "cpu_hours": None if seconds is None else seconds / 3600.0,
+            }  # fmt: skip
 
 
-def page(found: Mapping[World, tuple[Scores, float]], setup: Setup, command: str) -> str:
-    """training_seeds.md."""
-    lines = [
-        "# How much the training seed decides", "",
-        f"`{command}`", "",
-        "The learned methods of [table I](table1.md) on the sets low of both worlds, trained anew with seeds of their own for",
-        f"weights, windows and noise, on the same {NUM_EPISODES - NUM_VALIDATION:,} episodes of that set alone, with",
-        f"{setup.steps * setup.batch_size:,} windows each (GrAMMI a sixth more: it goes on from the one without). The shipped",
-        "networks saw four to thirteen times as many, of all sets of their world; what this page is for is the spread. As many",
-        "for every seed would take some 14 hours of a core more. The rest is as in table I:",
-        f"{setup.config.num_windows} random moments of {NUM_EVALUATION} episodes with a seed of their own,",
-        f"{setup.config.num_hypotheses} hypotheses, distances over the map's longer side, nobody told the hideout.", "",
-        "Square brackets: 95 % interval, bootstrap over episodes. ±: standard deviation between the training seeds.", "",
-    ]  # fmt: skip
-    for world, (scores, _) in found.items():
-        lines += [f"## {world} low: CADENCE against the better GrAMMI", "", *lead_table(scores)]
+def tables(found: Mapping[World, tuple[Scores, float]], setup: Setup) -> dict[str, list[publishing.Row]]:
+    """All numbers."""
+    rows: dict[str, list[publishing.Row]] = {kind: [] for kind in ("leads", "pairs", "errors", "budgets")}
     for world, (scores, scale_m) in found.items():
-        lines += [f"## {world} low: means over the seeds", "", *spread_tables(scores, scale_m)]
-        lines += [f"### What the trainings cost: {world} low", "", *budget_table(world, scores, setup)]
-    return "\n".join(lines).rstrip() + "\n"
+        key = f"{world} low"
+        rows["leads"] += (compared := list(lead_rows(key, scores)))
+        rows["pairs"] += [pair_row(key, scores)] if compared else []
+        rows["errors"] += error_rows(key, scores, scale_m)
+        rows["budgets"] += budget_rows(key, world, scores, setup)
+    return {f"training_seeds_{kind}": part for kind, part in rows.items() if part}
+
+
+def section(measured: Measurement) -> str:
+    """Leads of every seed, and over all pairs of seeds."""
+    lines = []
+    for pair in measured.rows("pairs"):
+        rows = measured.rows("leads", set=pair["set"], measure="energy score")
+        pairs = f"{pair['lead_percent_least']:.1f} to {pair['lead_percent_greatest']:.1f}"
+        single = ", ".join(f"{row['lead_percent']:.1f}" for row in rows if row["seed"] != "mean")
+        (mean,) = (row for row in rows if row["seed"] == "mean")
+        lines.append([pair["set"], single, publishing.interval(mean, "lead_percent", ".0f"), pairs])
+    heads = ["lead over the better GrAMMI, %", "seed by seed", "mean of the seeds", "all pairs of seeds"]
+    return publishing.table(heads, lines)
 
 
 def main() -> int:
-    """Train and score what is not done, then write the page."""
+    """Train and score what is not done, and publish what is there."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--work", type=Path, default=Path("runs/training_seeds"))
     parser.add_argument("--worlds", default=",".join(WORLDS))
@@ -257,7 +259,7 @@ def main() -> int:
     parser.add_argument("--batch", type=int, default=256)
     parser.add_argument("--windows", type=int, default=1000)
     parser.add_argument("--hypotheses", type=int, default=30)
-    parser.add_argument("--publish", type=Path, help="folder for training_seeds.md; without it the page is printed")
+    parser.add_argument("--publish", type=Path, metavar="DOCS", help="write numbers and section below this folder")
     parser.add_argument("--page", action="store_true", help="train nothing")
     args = parser.parse_args()
     worlds = [world for world in WORLDS if world in args.worlds.split(",")]
@@ -278,12 +280,11 @@ def main() -> int:
         scale_m = run.episodes.scale_m
         assert scale_m is not None  # the simulator says it
         found[world] = scores_of(world, run, setup), scale_m
-    shown = [word for word in sys.argv[1:] if word != "--page"]
-    text = page(found, setup, shlex.join(["python", "benchmarks/training_seeds.py", *shown]))
-    if args.publish is None:
-        print(text)
-    else:
-        write_atomic(args.publish / "training_seeds.md", text)
+    facts = publishing.facts_of("training_seeds") | {
+        "num_windows": args.windows, "num_hypotheses": args.hypotheses, "num_episodes": NUM_EVALUATION,
+        "num_training_episodes": NUM_EPISODES - NUM_VALIDATION, "num_training_windows": args.steps * args.batch,
+    }  # fmt: skip
+    publishing.publish(Measurement("training_seeds", facts, tables(found, setup)), section, args.publish)
     return 0
 
 

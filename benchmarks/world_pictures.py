@@ -1,6 +1,6 @@
 """Pictures of the paper's worlds: the map, many episodes, and what is known of the places.
 
-python benchmarks/world_pictures.py --publish docs/images
+python -m benchmarks.world_pictures --publish docs/images
 """
 
 import argparse

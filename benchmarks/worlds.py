@@ -3,33 +3,38 @@
 Simulates Prison Escape with the detection factors of recorded reference episodes and with the sets' own (tuned to the paper's
 rates), Narco with its own, and compares lengths, rates, gaps, strides and where episodes end. With --reference DIR, a folder
 that holds low/, med/ and high/ with MCAP logs of the original simulator (and may hold low_extra.npz, for the replay step by
-step), the reference comes from there; without it from the numbers kept in tests/cadence. --publish DIR writes worlds.md there;
---keep FILE writes the reference's numbers.
+step), the reference comes from there; without it from the numbers kept in tests/cadence/worlds. --keep FILE writes the
+reference's numbers.
+
+    python -m benchmarks.worlds --reference ../shared/data/prison_reference --publish docs
 """
 
 import argparse
 import json
-import time
 from pathlib import Path
 
 import numpy as np
 
+from benchmarks import publishing
+from benchmarks.episode_statistics import EpisodeStatistics, compare, episode_statistics, site_difference
+from benchmarks.publishing import Measurement
 from cadence.recordings import Recordings
 from cadence.worlds import narco, prison, prison_map
 from cadence.worlds.draws import Draws
 from cadence.worlds.prison_fugitive import Fugitives, Sight, stride
-from cadence.worlds.statistics import EpisodeStatistics, compare, episode_statistics, site_difference
 from pipeline.episodes.recordings import RecordingsConfig, load_recordings
 from pipeline.progress import Progress
 
-KEPT = Path(__file__).resolve().parents[1] / "tests" / "cadence" / "prison_reference.json"
+KEPT = Path(__file__).resolve().parents[1] / "tests" / "cadence" / "worlds" / "prison_reference.json"
 REFERENCE_FACTORS = {"low": 3.5, "med": 6.4, "high": 8.3}
 PAPER_RATES = {"low": 0.129, "med": 0.440, "high": 0.631}
 NARCO_RATES = {"low": 0.138, "high": 0.315}
 SITES = np.concatenate([prison_map.KNOWN_SITES, prison_map.UNKNOWN_SITES]) * prison_map.CELL_M
 NUM_KNOWN = len(prison_map.KNOWN_SITES)
 RADIUS_M = 50.5 * prison_map.CELL_M
-UNITS = {"length": "steps", "rate": "", "gap": "steps", "stride": "cells"}
+STRIDES = (1.41, 5.0, 6.0, 7.07, 8.0)
+"""Lengths of most strides, in cells: targets walk on whole cells."""
+UNITS = {"length": "steps", "rate": None, "gap": "steps", "stride": "cells"}
 
 
 def of_prison(recordings: Recordings) -> EpisodeStatistics:
@@ -74,52 +79,61 @@ def reference_statistics(folder: Path | None, cache: Path) -> dict[str, EpisodeS
     return found
 
 
-def both(values: np.ndarray, scale: float = 1.0, digits: int = 0) -> str:
-    """Mean / median."""
-    return f"{scale * values.mean():.{digits}f} / {scale * np.median(values):.{digits}f}"
-
-
-def describe(item: EpisodeStatistics) -> str:
-    """Cells of a table row: lengths, rates, gaps, strides, episodes that end at the known hideout."""
-    gaps, strides = np.percentile(item.gap, [50, 90]), np.rint(item.stride * 100) / 100
-    peaks = " ".join(f"{100 * np.mean(strides == value):.1f}" for value in (1.41, 5.0, 6.0, 7.07, 8.0))
-    known = f"{100 * item.share_at(0, NUM_KNOWN):.1f}"
-    return f"{both(item.length)} | {both(item.rate, 100, 1)} | {gaps[0]:.0f} / {gaps[1]:.0f} | {peaks} | {known}"
-
-
-def prison_tables(reference: dict[str, EpisodeStatistics], num_episodes: int, seed: int) -> list[str]:
-    """Lines of the tables of the world prison."""
-    table = ["| episodes | factor | length | rate % | gap | strides % | known % |", "|---|---|---|---|---|---|---|"]
-    apart = ["| set | measure | largest difference | area | chance |", "|---|---|---|---|---|"]
+def prison_tables(
+    reference: dict[str, EpisodeStatistics], num_episodes: int, seed: int
+) -> tuple[list[publishing.Row], list[publishing.Row]]:
+    """What the original's episodes and ours are like, and how far ours with the same factor are from the original's."""
+    rows, distances = [], []
     for name, item in reference.items():
-        table.append(f"| original, {name} ({len(item.length)}) | {REFERENCE_FACTORS[name]} | {describe(item)} |")
+        rows.append(describe(name, "original", REFERENCE_FACTORS[name], item))
         for factor in (REFERENCE_FACTORS[name], None):
             config = prison.PrisonConfig(set=name, factor=factor)
-            begin = time.perf_counter()
             ours = of_prison(prison.simulate_prison_batch(config, seed, np.arange(num_episodes)))
-            speed = num_episodes / (time.perf_counter() - begin)
-            print(f"{name}, factor {config.detection_factor}: {speed:.1f} episodes a second", flush=True)
-            label = f"ours, {name}" if factor else f"ours, {name}, tuned to {100 * PAPER_RATES[name]:.1f} %"
-            table.append(f"| {label} ({num_episodes}) | {config.detection_factor} | {describe(ours)} |")
+            rows.append(describe(name, "ours" if factor else "ours, tuned", config.detection_factor, ours))
             if factor is None:
                 continue
             for measure, far in compare(ours, item).items():
-                area = f"{far.area:.3g} {UNITS[measure]}".strip()
-                apart.append(f"| {name} | {measure} | {far.largest:.3f} | {area} | {far.chance:.2g} |")
-            apart.append(f"| {name} | site of the end | {site_difference(ours, item, len(SITES)):.3f} | | |")
-    return [*table, "", *apart]
+                distances.append({
+                    "set": name, "measure": measure, "largest_difference": far.largest, "area": far.area,
+                    "unit": UNITS[measure], "chance": far.chance,
+                })  # fmt: skip
+            apart = site_difference(ours, item, len(SITES))
+            distances.append({
+                "set": name, "measure": "site of the end", "largest_difference": apart, "area": None, "unit": None,
+                "chance": None,
+            })  # fmt: skip
+    return rows, distances
 
 
-def narco_table(num_episodes: int, seed: int) -> list[str]:
-    """Lines of the table of the world narco."""
+def describe(name: str, episodes: str, factor: float, item: EpisodeStatistics) -> publishing.Row:
+    """Lengths, rates, gaps, strides, and how many episodes end at a hideout that the trackers know."""
+    gaps, strides = np.percentile(item.gap, [50, 90]), np.rint(item.stride * 100) / 100
+    shares = {f"stride_{f'{cells:g}'.replace('.', '_')}_percent": 100 * np.mean(strides == cells) for cells in STRIDES}
+    return {
+        "set": name, "episodes": episodes, "num_episodes": len(item.length), "detection_factor": factor,
+        **mean_and_median("length_steps", item.length), **mean_and_median("rate_percent", 100 * item.rate),
+        "gap_steps_median": gaps[0], "gap_steps_90": gaps[1], **shares,
+        "ended_at_known_percent": 100 * item.share_at(0, NUM_KNOWN),
+    }  # fmt: skip
+
+
+def mean_and_median(column: str, values: np.ndarray) -> publishing.Row:
+    """Both over episodes."""
+    return {f"{column}_mean": values.mean(), f"{column}_median": np.median(values)}
+
+
+def narco_table(num_episodes: int, seed: int) -> list[publishing.Row]:
+    """What our episodes of the world narco are like."""
     sites = narco.HIDEOUTS * narco.UNIT_M
-    table = ["| set | paper's rate % | our rate % | length | reached a hideout % |", "|---|---|---|---|---|"]
+    rows = []
     for name, rate in NARCO_RATES.items():
         episodes = narco.simulate_narco_batch(narco.NarcoConfig(set=name), seed, np.arange(num_episodes))
         item = episode_statistics(episodes, narco.UNIT_M, sites, 50.5 * narco.UNIT_M)
-        cells = (f"{100 * rate:.1f}", both(item.rate, 100, 1), both(item.length), f"{100 * item.share_at(0, len(sites)):.1f}")
-        table.append(f"| {name} | {' | '.join(cells)} |")
-    return table
+        rows.append({
+            "set": name, "paper_rate_percent": 100 * rate, **mean_and_median("rate_percent", 100 * item.rate),
+            **mean_and_median("length_steps", item.length), "reached_hideout_percent": 100 * item.share_at(0, len(sites)),
+        })  # fmt: skip
+    return rows
 
 
 def replay(path: Path, num_episodes: int) -> tuple[float, float]:
@@ -158,58 +172,46 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--cache", type=Path, default=Path("out/benchmarks/worlds"))
     parser.add_argument("--keep", type=Path, help="write the reference's numbers to this file")
-    parser.add_argument("--publish", type=Path, help="write worlds.md into this folder")
+    parser.add_argument("--publish", type=Path, metavar="DOCS", help="write numbers and section below this folder")
     arguments = parser.parse_args()
     reference = reference_statistics(arguments.reference, arguments.cache)
     if arguments.keep:
         keep(reference, arguments.keep)
-    lines = [
-        *prison_tables(reference, arguments.episodes, arguments.seed),
-        "",
-        *narco_table(arguments.episodes, arguments.seed),
-    ]
+    rows, distances = prison_tables(reference, arguments.episodes, arguments.seed)
+    tables = {"worlds": rows, "worlds_distances": distances, "worlds_narco": narco_table(arguments.episodes, arguments.seed)}
     extra = arguments.reference / "low_extra.npz" if arguments.reference else None
     if extra is not None and extra.is_file():
         episodes, steps = replay(extra, arguments.episodes)
-        lines += ["", f"Replay of {arguments.episodes} recorded episodes: {100 * episodes:.1f} % of them exact in every step, "]
-        lines[-1] += f"{100 * steps:.2f} % of the steps."
-    print("\n".join(lines))
-    if arguments.publish:
-        (arguments.publish / "worlds.md").write_text(page(lines, arguments))
+        same = {"exact_episodes_percent": 100 * episodes, "exact_steps_percent": 100 * steps}
+        tables["worlds_replay"] = [{"num_episodes": arguments.episodes, **same}]
+    publishing.publish(Measurement("worlds", publishing.facts_of("worlds"), tables), section, arguments.publish)
 
 
-def page(lines: list[str], arguments: argparse.Namespace) -> str:
-    """The page with its words."""
-    command = f"benchmarks/worlds.py --reference DIR --episodes {arguments.episodes} --seed {arguments.seed}"
-    rates = " / ".join(f"{100 * rate:.1f}" for rate in PAPER_RATES.values())
-    factors = " / ".join(str(factor) for factor in REFERENCE_FACTORS.values())
-    return WORDS.format(rates=rates, factors=factors, num=arguments.episodes, tables="\n".join(lines), command=command)
-
-
-WORDS = """# Do the worlds behave as the authors' simulators?
-
-Prison Escape: the original's recorded episodes (authors' configuration and policies, factors {factors}) beside ours with the
-same factors, and with the factors of our sets, which are tuned to the paper's mean rates ({rates} %). Ours are other
-episodes: other starts, hideouts and random numbers. Narco: no recorded episodes exist, only the paper's rates.
-
-* length, rate: mean / median over episodes, of steps and of the share of steps with a detection.
-* gap: median / 90th percentile of the steps between detections that do not follow each other.
-* strides: share of steps of 1.41, 5, 6, 7.07 and 8 cells; targets walk on whole cells.
-* known: share of episodes that end at the hideout known to the trackers.
-
-{tables}
-
-* largest difference: between the two distribution functions (Kolmogorov–Smirnov); area: between them (Wasserstein distance).
-* chance: of so large a difference were both the same and all values independent. Gaps and strides of one episode are not,
-  so that for them it is far too small.
-* site of the end: total variation distance over the 20 sites; two samples of 300 from one distribution differ by about 0.1.
-
-A recorded step is replayed by putting our fugitive where the recorded one was, among its trackers, with what it saw. It
-departs where the original draws a random block to plan from (in the shadow of the mountain on its planning grid), and stays
-off until it plans anew.
-
-Made by `{command} --publish docs/benchmarks`. Means of rates over 300 episodes have a standard error of about 1.4 points.
-"""
+def section(measured: Measurement) -> str:
+    """The original beside ours, set by set."""
+    columns = {
+        "length, steps": ("length_steps_mean", ".0f"), "detected, %": ("rate_percent_mean", ".1f"),
+        "longest gaps, steps": ("gap_steps_90", ".0f"), "strides of 7.07 cells, %": ("stride_7_07_percent", ".1f"),
+        "ended at a known site, %": ("ended_at_known_percent", ".1f"),
+    }  # fmt: skip
+    lines = []
+    for original in measured.rows(episodes="original"):
+        (ours,) = measured.rows(set=original["set"], episodes="ours")
+        cells = [f"{original[name]:{digits}} / {ours[name]:{digits}}" for name, digits in columns.values()]
+        lines.append([f"prison {original['set']}", *cells])
+    rates = [
+        f"{row['set']} {row['rate_percent_mean']:.1f} % (the paper: {row['paper_rate_percent']:.1f} %)"
+        for row in measured.rows("narco")
+    ]
+    text = f"Detected in narco: {', '.join(rates)}."
+    if "worlds_replay" in measured.tables:
+        (same,) = measured.rows("replay")
+        text += (
+            f" Put in the place of recorded fugitives, ours does the same in {same['exact_steps_percent']:.1f} % of the steps "
+            f"of {same['num_episodes']} episodes."
+        )
+    heads = ["original / ours", *columns]
+    return f"{publishing.table(heads, lines)}\n\n{text}"
 
 
 if __name__ == "__main__":

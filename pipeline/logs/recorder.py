@@ -23,7 +23,7 @@ _MESSAGE: Final = struct.Struct("<BQHIQQ")
 
 @dataclass(frozen=True)
 class Packing:
-    """How messages are put into chunks; the defaults are chosen by measurement (docs/benchmarks/log_writing.md).
+    """How messages are put into chunks; the defaults are chosen by measurement (docs/benchmarks/logs.md).
 
     compression  zstd, lz4 or none
     chunk_bytes  a chunk ends with the message that fills it; before compression

@@ -1,12 +1,10 @@
 """The rival trackers' smoothing against the direct solution of the same linear Gaussian problem, with missed scans."""
 
-from importlib import import_module
-from pathlib import Path
-from types import ModuleType
-
 import numpy as np
 import pytest
 
+from benchmarks.association_logs import Log
+from benchmarks.association_trackers import Settings, tracked
 from benchmarks.rts_smoother import rts_smoothed
 from cadence.arrays import Float64s
 
@@ -68,23 +66,17 @@ def test_smoother_gives_the_direct_solution_across_missed_scans() -> None:
     assert abs(mean[5, 0] - expected[0][5, 0]) > 10.0 * SIGMA_M  # nobody can have left the smoother out
 
 
-@pytest.fixture
-def trackers(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    pytest.importorskip("stonesoup")
-    monkeypatch.syspath_prepend(str(Path(__file__).resolve().parents[2] / "benchmarks"))
-    return import_module("association_trackers")
-
-
 @pytest.mark.parametrize("kind", ["GNN", "JPDA"])
-def test_tracks_are_smoothed_by_all_detections(trackers: ModuleType, kind: str) -> None:
+def test_tracks_are_smoothed_by_all_detections(kind: str) -> None:
     """One target along x, seen without doubt: what the rival says at every scan is the direct solution."""
-    log_of, seen = import_module("association_logs").Log, ~np.array(IS_MISSED)
+    pytest.importorskip("stonesoup")
+    seen = ~np.array(IS_MISSED)
     place = np.stack([np.array(SEEN_M)[seen], np.zeros(seen.sum())], axis=1)
     times, grid = np.array(SCAN_S)[seen], np.array(SCAN_S)
     truth = np.zeros((1, len(grid), 2))
-    log = log_of(times, place, SIGMA_M, np.zeros(len(times), int), grid, truth, 1, 100.0, SPEED_MPS)
-    settings = trackers.Settings(DIFFUSION, 0.0, 8.0, 3600.0, 1e-30, 0.999)
-    estimate = trackers.tracked(kind, settings, log)
+    log = Log(times, place, SIGMA_M, np.zeros(len(times), int), grid, truth, 1, 100.0, SPEED_MPS)
+    settings = Settings(DIFFUSION, 0.0, 8.0, 3600.0, 1e-30, 0.999)
+    estimate = tracked(kind, settings, log)
     expected, covariance = direct()
     assert estimate.position_m[0, :, 0] == pytest.approx(expected[:, 0], rel=1e-6)
     assert estimate.position_m[0, :, 1] == pytest.approx(np.zeros(len(grid)), abs=1e-9)

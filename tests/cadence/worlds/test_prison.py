@@ -1,21 +1,17 @@
 """Prison Escape: the map, the fugitive's routes and evasion, whole episodes beside the original's recorded ones."""
 
-import json
-from pathlib import Path
-
 import numpy as np
 import pytest
 
-from cadence.recordings import Recordings
+from benchmarks.episode_statistics import compare, site_difference
+from benchmarks.worlds import KEPT, kept_statistics, of_prison
 from cadence.worlds.block_route import BlockPlanner
 from cadence.worlds.draws import Draws
 from cadence.worlds.perlin import enlarge_twice, fractal, octave
 from cadence.worlds.prison import PrisonConfig, simulate_prison, simulate_prison_batch
 from cadence.worlds.prison_fugitive import Fugitives, Sight, nearest_forest, stride, turn_from
 from cadence.worlds.prison_map import CELL_M, HIDDEN_CAMERAS, KNOWN_SITES, SEEN_CAMERAS, SIDE, UNKNOWN_SITES, prison_map
-from cadence.worlds.statistics import EpisodeStatistics, compare, episode_statistics, site_difference
 
-KEPT = Path(__file__).parent / "prison_reference.json"
 SITES = np.concatenate([KNOWN_SITES, UNKNOWN_SITES])
 LIKE_REFERENCE = PrisonConfig("low", factor=3.5)
 
@@ -23,19 +19,6 @@ LIKE_REFERENCE = PrisonConfig("low", factor=3.5)
 @pytest.fixture(scope="module")
 def episodes():
     return simulate_prison_batch(LIKE_REFERENCE, 1, np.arange(60))
-
-
-def statistics(recordings):
-    return episode_statistics(recordings, CELL_M, SITES * CELL_M, 50.5 * CELL_M)
-
-
-def kept(name):
-    entry = json.loads(KEPT.read_text())[name]
-    gap, squares = (np.repeat(*np.array(entry[key]).T) for key in ("gap", "stride_squared"))
-    strides = np.round(np.sqrt(squares), 3)
-    return EpisodeStatistics(
-        np.array(entry["length"], float), np.array(entry["rate"]), gap.astype(float), strides, np.array(entry["site"])
-    )
 
 
 def test_noise_is_zero_on_the_lattice_and_periodic():
@@ -171,7 +154,7 @@ def test_it_hides_from_a_near_pursuer_after_seven_steps_and_gives_up_after_fifty
 
 
 def test_episodes_end_at_a_hideout_and_keep_off_the_mountain(episodes):
-    item = statistics(episodes)
+    item = of_prison(episodes)
     assert (item.site >= 0).all() and (item.length < 2000).all()
     cell = np.rint(episodes.position_m / CELL_M).astype(int)
     np.testing.assert_allclose(cell * CELL_M, episodes.position_m)
@@ -191,38 +174,12 @@ def test_trackers_keep_their_speeds_and_helicopters_rest(episodes):
 
 def test_episodes_are_like_the_originals(episodes):
     # Distances of 60 episodes from the 298 recorded; two such samples of one distribution differ by less in 19 of 20 cases.
-    ours, reference = statistics(episodes), kept("low")
+    ours, reference = of_prison(episodes), kept_statistics(KEPT)["low"]
     found = compare(ours, reference)
     assert found["length"].largest < 0.19 and found["rate"].largest < 0.19
     assert found["gap"].largest < 0.12 and found["stride"].largest < 0.06
     assert site_difference(ours, reference, len(SITES)) < 0.3
     assert abs(ours.share_at(0, len(KNOWN_SITES)) - reference.share_at(0, len(KNOWN_SITES))) < 0.1
-
-
-def test_distances_between_samples_by_hand():
-    same = {"rate": np.array([0.5, 0.7]), "gap": np.array([2.0, 4.0, 4.0])}
-    one = EpisodeStatistics(np.array([1.0, 2.0]), stride=np.array([5.0, 8.0]), site=np.array([0, 1]), **same)
-    two = EpisodeStatistics(np.array([2.0, 3.0]), stride=np.array([5.0, 5.0]), site=np.array([0, -1]), **same)
-    found = compare(one, two)
-    assert (found["length"].largest, found["length"].area) == (0.5, 1.0)
-    assert found["rate"].area == 0 and found["stride"].area == 1.5 and found["gap"].chance == 1.0
-    assert site_difference(one, two, 2) == 0.5
-
-
-def test_statistics_by_hand():
-    place = np.array([[0, 0], [3, 4], [3, 4], [10, 10], [10, 11]], dtype=np.float32)
-    made = Recordings(
-        60.0,
-        np.array([0, 3, 5]),
-        place,
-        np.array([1, 0, 1, 1, 1], bool),
-        np.zeros((5, 0, 2), np.float32),
-        np.zeros((2, 2), np.float32),
-    )
-    found = episode_statistics(made, 1.0, np.array([[9.0, 9.0], [10.0, 12.0]]), 1.5)
-    assert found.length.tolist() == [3, 2] and found.rate.tolist() == [pytest.approx(2 / 3), 1.0]
-    assert found.gap.tolist() == [2] and found.stride.tolist() == [5, 0, 1] and found.site.tolist() == [-1, 1]
-    assert (found.share_at(0, 1), found.share_at(1, 2)) == (0.0, 0.5)
 
 
 def test_an_episode_depends_on_nothing_but_its_index(episodes):
