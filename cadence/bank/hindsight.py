@@ -46,14 +46,23 @@ def num_tests(windows: WindowBatch, shown_later: Detections) -> int:
 
 
 def hindsight_scores(estimator: Estimator, windows: WindowBatch, shown_later: Detections) -> Tensor:
+    """`scores_in_hindsight` of NUM_SAMPLES hypotheses of an estimator."""
+    return scores_in_hindsight(estimator.sample(windows, NUM_SAMPLES).position_m, windows, shown_later)
+
+
+def scores_in_hindsight(position_m: Tensor, windows: WindowBatch, shown_later: Detections) -> Tensor:
     """Energy scores at each agent's detections [B, A, N] that `windows` do not hold, anywhere on their grid: their means [R].
 
-    R runs over the agents of windows with any such detection.
+    R runs over the agents of windows with any such detection. Errors are divided by the time to the nearest detection in the
+    window, so that long gaps do not rule alone.
 
-    Errors are divided by the time to the nearest detection in the window, so that long gaps do not rule alone.
+    Args:
+        position_m: [B, NUM_SAMPLES, A, T, 2] hypotheses of equal weight.
+        windows: what they were drawn from.
+        shown_later: the detections to compare with.
     """
     is_used = _is_used(windows, shown_later)
-    position = estimator.sample(windows, NUM_SAMPLES).position_m.nan_to_num()
+    position = position_m.nan_to_num()
     at = ((shown_later.time_s - windows.time_s[0]) / windows.step_s).clamp(0, windows.num_steps - 1.001)
     before = at.floor().long()
     share = (at - before)[:, None, :, :, None]

@@ -10,11 +10,16 @@ from cadence.constraints import Constraint
 from cadence.constraints.motion import SpeedConstraint
 from cadence.constraints.obstacles import ObstacleConstraint, Obstacles
 from cadence.constraints.repair import repair
+from cadence.constraints.speed import exceeds, limit_steps
 from cadence.diffusion.guidance import clean_estimate_guidance
 from cadence.resampling import systematic
 from cadence.types import WindowBatch
 
 _PINNED_SHARE = 0.05
+_HELD_SHARE = 0.5
+"""Steps that the bank knows to within so many step lengths stay where they are when a track is slowed down."""
+
+_ROUNDS = 4
 _LEAST_WEIGHT = 1e-3
 
 
@@ -43,7 +48,8 @@ class Feasibility:
 
     obstacles      may be empty
     margin_m       kept from them
-    max_speed_mps  None for no limit
+    max_speed_mps  that is stated, None for no limit
+    plausible_speed_mps  what the log's own detections let one believe; tracks keep it, but are not guided by it
     step_s         of the grid
     num_steps      of guidance on each clean estimate
     """
@@ -53,17 +59,18 @@ class Feasibility:
     max_speed_mps: float | None
     step_s: float
     offset_m: Tensor
+    plausible_speed_mps: float | None = None
     num_steps: int = 3
 
     @classmethod
-    def of(cls, windows: WindowBatch, config: GuidanceConfig) -> Self:
+    def of(cls, windows: WindowBatch, config: GuidanceConfig, plausible_speed_mps: float | None = None) -> Self:
         """What the active agents of windows, one a row, must obey; without a context there are no obstacles."""
         window = windows.is_active.nonzero()[:, 0]
         context = windows.context
         datum_m = torch.zeros(windows.num_windows, 2, dtype=torch.float64) if context is None else context.datum_m
         obstacles = Obstacles.none() if context is None else context.obstacles
         offset_m = datum_m[window, None, None]
-        return cls(obstacles, config.margin_m, config.max_speed_mps, windows.step_s, offset_m)
+        return cls(obstacles, config.margin_m, config.max_speed_mps, windows.step_s, offset_m, plausible_speed_mps)
 
     @property
     def is_limited(self) -> bool:
@@ -80,25 +87,80 @@ class Feasibility:
         return clean_estimate_guidance(position_m, constraints, sigma_m[:, None, :, None], self.num_steps)
 
     def finish(self, position_m: Tensor, sigma_m: Tensor, length_m: float) -> tuple[Tensor, Tensor, Tensor]:
-        """Final repair of hypotheses [R, K, T, 2].
+        """Hypotheses [R, K, T, 2] as they may be: no step too long, no segment through an obstacle.
 
         Steps that the detections pin (bank sigma under a twentieth of a step length) stay exactly.
 
         Returns:
             Positions, weight of each hypothesis of a row [R, K] — one that had to be moved by many sigmas counts
-            less — and whether it is free of collisions [R, K].
+            less — and which of them are to be kept [R, K]: those within all limits, or where there are none in a row, those
+            that are only faster than is plausible; none at all where every one breaks what was stated.
         """
-        if not self.obstacles.count:
+        if not self.obstacles.count and self.longest_m is None:
             even = torch.full(position_m.shape[:2], 1.0 / position_m.shape[1], dtype=torch.float64)
             return position_m, even, torch.ones_like(even, dtype=torch.bool)
-        is_pinned = (sigma_m <= _PINNED_SHARE * length_m)[:, None].expand(position_m.shape[:3])
-        moved, is_feasible = repair(position_m, self.obstacles, is_pinned, self.margin_m, offset_m=self.offset_m)
+        moved, is_feasible = self._within_limits(position_m, sigma_m, length_m)
+        if self.plausible_speed_mps is not None:
+            is_plausible = is_feasible & ~exceeds(moved, self.plausible_speed_mps * self.step_s)
+            is_feasible = torch.where(is_plausible.any(1, keepdim=True), is_plausible, is_feasible)
         shift = (moved - position_m).norm(dim=-1) / (sigma_m[:, None] + _PINNED_SHARE * length_m)
         log_weight = -0.5 * (shift**2).mean(-1)
         weight = torch.where(is_feasible, torch.exp(log_weight - log_weight.amax(1, keepdim=True)), 0.0).clamp_min(
             _LEAST_WEIGHT
         )
         return moved, weight / weight.sum(1, keepdim=True), is_feasible
+
+    @property
+    def longest_m(self) -> float | None:
+        """How long a step may be."""
+        limits = [speed for speed in (self.max_speed_mps, self.plausible_speed_mps) if speed is not None]
+        return min(limits) * self.step_s if limits else None
+
+    def _within_limits(self, position_m: Tensor, sigma_m: Tensor, length_m: float) -> tuple[Tensor, Tensor]:
+        is_pinned = (sigma_m <= _PINNED_SHARE * length_m)[:, None].expand(position_m.shape[:3])
+        is_held = (sigma_m <= _HELD_SHARE * length_m) | (sigma_m == sigma_m.amin(dim=1, keepdim=True))
+        held = is_held[:, None].expand(position_m.shape[:3])
+        place = Place(self.obstacles, self.margin_m, self.offset_m)
+        moved, is_feasible = within_limits(position_m, place, is_pinned, self.longest_m, held)
+        if self.max_speed_mps is not None:
+            is_feasible = is_feasible & ~exceeds(moved, self.max_speed_mps * self.step_s)
+        return moved, is_feasible
+
+
+@dataclass(frozen=True, eq=False)
+class Place:
+    """What is in the way: obstacles, the margin to keep from them, and the datum of the rows in their frame [R, 1, 1, 2]."""
+
+    obstacles: Obstacles
+    margin_m: float
+    offset_m: Tensor
+
+
+def within_limits(
+    position_m: Tensor, place: Place, is_pinned: Tensor, longest_m: float | None, is_held: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Tracks [R, K, T, 2] led around obstacles and slowed down, in turns as often as helps: the one may undo the other.
+
+    Args:
+        position_m: the tracks.
+        place: what is in the way.
+        is_pinned: [R, K, T] steps that a way round an obstacle leaves exactly where they are.
+        longest_m: how long a step may be, or None.
+        is_held: [R, K, T] steps that stay where they are when a track is slowed down; at least one a track.
+
+    Returns:
+        The tracks, and which of them keep clear of the obstacles [R, K]; ask `exceeds` whether they are slow enough.
+    """
+    moved, is_clear = position_m, torch.ones(position_m.shape[:2], dtype=torch.bool)
+    for _ in range(_ROUNDS if place.obstacles.count and longest_m is not None else 1):
+        if longest_m is not None:
+            slowed, _ = limit_steps(moved.flatten(0, 1), is_held.flatten(0, 1), longest_m)
+            moved = slowed.view_as(moved)
+        if place.obstacles.count:
+            moved, is_clear = repair(moved, place.obstacles, is_pinned, place.margin_m, offset_m=place.offset_m)
+        if longest_m is None or not bool((exceeds(moved, longest_m) | ~is_clear).any()):
+            break
+    return moved, is_clear
 
 
 def resampled(position_m: Tensor, weight: Tensor, seeds: Tensor) -> Tensor:

@@ -7,9 +7,10 @@ moves it to the network or to the bank alone only where detections withheld from
 import dataclasses
 import math
 
+import torch
 from torch import Tensor
 
-from cadence.bank.hindsight import LEAST_TESTS, hindsight_scores, num_tests, withhold
+from cadence.bank.hindsight import LEAST_TESTS, NUM_SAMPLES, num_tests, scores_in_hindsight, withhold
 from cadence.diffusion.general import GateScores, GeneralModel
 from cadence.types import Detections, WindowBatch
 
@@ -46,8 +47,12 @@ class _Choice:
 def _choose(model: GeneralModel, windows: WindowBatch, unseen: Detections) -> _Choice:
     if num_tests(windows, unseen) < LEAST_TESTS:
         return _Choice(_SHARES[0], None, None)
+    network_m, bank_m = (model.with_shares(share).sample(windows, NUM_SAMPLES).position_m for share in (1.0, 0.0))
+    # Half and half begins with the same noise: it is the network's hypotheses where those are moved, and the bank's elsewhere.
+    is_moved = model.with_shares(0.5).moves(NUM_SAMPLES)[:, None, None, None]
     half, network, bank = (
-        hindsight_scores(dataclasses.replace(model, share_past=share, share_future=share), windows, unseen) for share in _SHARES
+        scores_in_hindsight(position_m, windows, unseen)
+        for position_m in (torch.where(is_moved, network_m, bank_m), network_m, bank_m)
     )
     ratios = float(network.mean() / bank.mean()), float(half.mean() / bank.mean())
     # the larger gain over half and half, counted in standard errors

@@ -18,6 +18,7 @@ from cadence.diffusion.feasible import Feasibility, GuidanceConfig, resampled
 from cadence.diffusion.residual import ResidualContext, build_context
 from cadence.diffusion.sampler import even_angles, sample_ddim, sample_dpmpp_2m, sample_rotation
 from cadence.diffusion.schedule import clean_from
+from cadence.diffusion.transport import bend_of, smoothed_displacement
 from cadence.network.residual import ResidualNetwork
 from cadence.types import Detections, HypothesisSet, WindowBatch
 
@@ -52,6 +53,8 @@ class GeneralModel:
     sampler    "rotation", "ddim" or "dpmpp"
     num_steps  evaluations of the network for each hypothesis
     guidance   how constraints act: a speed limit, and the obstacles of the windows' context
+    plausible_speed_mps  what the log's detections show of how fast its targets are; no track is faster
+    is_smooth  what the network adds to a track of the bank is smoothed (`cadence.diffusion.transport`)
     share_past, share_future  share of the hypotheses that the network moves, up to the origin and after it; the others stay
                samples of the bank
     bf16       network in bfloat16: about twice as fast where the processor knows it
@@ -64,6 +67,8 @@ class GeneralModel:
     sampler: SamplerName = "rotation"
     num_steps: int = 6
     guidance: GuidanceConfig = field(default_factory=GuidanceConfig)
+    plausible_speed_mps: float | None = None
+    is_smooth: bool = True
     share_past: float = 1.0
     share_future: float = 1.0
     bf16: bool = False
@@ -81,34 +86,32 @@ class GeneralModel:
         The status of an agent is "guidance_diverged" where samples of the bank had to stand in, "infeasible" where a
         hypothesis could not be led out of an obstacle.
         """
-        limits = Feasibility.of(windows, self.guidance)
+        limits = Feasibility.of(windows, self.guidance, self.plausible_speed_mps)
         posterior = self.bank.posterior(windows, num_hypotheses)
         sample_m = self.denoised(posterior, windows, limits.guide if self._guides(limits) else None)
         is_finite = torch.isfinite(sample_m).flatten(1).all(1)
         sample_m = torch.where(is_finite[:, None, None, None], sample_m, posterior.sample_m)
         drawn = scatter_hypotheses(sample_m, windows)
-        if self.guidance.mode == "none" or not len(sample_m):
+        is_free = self.guidance.mode == "none" or not (limits.obstacles.count or limits.longest_m)
+        if is_free or not len(sample_m):
             return with_status(drawn, windows, ~is_finite, torch.zeros_like(is_finite))
-        kept_m, row_weight, is_feasible = limits.finish(
-            sample_m, self._sigma_m(windows, limits), self.bank.length_m(windows.step_s)
-        )
+        kept_m, row_weight, is_feasible = limits.finish(sample_m, posterior.sigma_m, self.bank.length_m(windows.step_s))
+        # What keeps no limit is drawn again from what does; where nothing does, that is said instead.
+        is_hopeless = ~is_feasible.any(1)
+        chance = torch.where(is_feasible | is_hopeless[:, None], row_weight, 0.0)
+        chance = chance / chance.sum(1, keepdim=True)
+        is_mixed = torch.ones_like(is_hopeless) if windows.num_agents > 1 else ~is_feasible.all(1) & ~is_hopeless
+        seeds = active_rows(windows)[1]
+        kept_m[is_mixed] = resampled(kept_m[is_mixed], chance[is_mixed], seeds[is_mixed])
         weight = drawn.weight
         if windows.num_agents == 1:
             weight = weight.clone()
-            weight[windows.is_active[:, 0]] = row_weight
-        else:
-            kept_m = resampled(kept_m, row_weight, active_rows(windows)[1])
+            weight[windows.is_active[:, 0]] = torch.where(is_mixed[:, None], 1.0 / num_hypotheses, row_weight)
         kept = HypothesisSet(scatter_hypotheses(kept_m, windows).position_m, weight, drawn.status)
-        return with_status(kept, windows, ~is_finite, ~is_feasible.all(1))
+        return with_status(kept, windows, ~is_finite, is_hopeless)
 
     def _guides(self, limits: Feasibility) -> bool:
         return self.guidance.mode == "clean" and limits.is_limited
-
-    def _sigma_m(self, windows: WindowBatch, limits: Feasibility) -> Tensor:
-        """How sure the bank is of every step [R, T]; of no matter where nothing is repaired."""
-        if limits.obstacles.count:
-            return self.bank.posterior(windows, 1).sigma_m
-        return torch.ones(int(windows.is_active.sum()), windows.num_steps)
 
     def denoised(self, posterior: BankPosterior, windows: WindowBatch, guide: CleanHook | None = None) -> Tensor:
         """The bank's samples as the network moves them [R, K, T, 2], clean estimates led by `guide`; no repair."""
@@ -118,7 +121,13 @@ class GeneralModel:
         length_m = self.bank.length_m(windows.step_s)
         context = build_context(posterior, rows, windows.time_s, windows.step_s, length_m)
         residual = self._denoise(posterior, context, guide)
-        return posterior.mean_m[:, None] + posterior.sigma_m[:, None, :, None] * residual.double()
+        moved_m = posterior.mean_m[:, None] + posterior.sigma_m[:, None, :, None] * residual.double()
+        if not self.is_smooth:
+            return moved_m
+        added_m = smoothed_displacement(moved_m - posterior.sample_m, posterior.sigma_m, bend_of(posterior.sample_m))
+        smooth_m = posterior.sample_m + added_m
+        # Smoothing takes back a part of what guidance did.
+        return smooth_m if guide is None else guide(smooth_m, posterior.sigma_m, slice(None))
 
     @torch.inference_mode()
     def _denoise(self, posterior: BankPosterior, context: ResidualContext, guide: CleanHook | None) -> Tensor:
@@ -138,17 +147,22 @@ class GeneralModel:
         assert network is not None
         num_rows, num_hypotheses = noise.shape[:2]
         context = context.to(self.device)
-        code = network.encode(context).repeat_interleave(num_hypotheses, dim=0)
-        wide = context.repeated(num_hypotheses)
         rows = slice(begin, begin + num_rows)
         mean, sigma = posterior.mean_m[rows, None], posterior.sigma_m[rows]
-        part = self._part(num_hypotheses, context).repeat(num_rows, 1, 1)
+        part = self._part(num_hypotheses, context)
+        is_moved = self.moves(num_hypotheses)  # the others stay samples of the bank: the network need not be asked
+        num_moved = int(is_moved.sum())
+        code = network.encode(context).repeat_interleave(num_moved, dim=0)
+        wide, share = context.repeated(num_moved), part[is_moved].repeat(num_rows, 1, 1)
 
         def denoise(state: Tensor, angle: float) -> Tensor:
-            level = torch.full((len(state),), angle, device=state.device)
+            level = torch.full((len(code),), angle, device=state.device)
+            asked = state.view(num_rows, num_hypotheses, -1, 2)[:, is_moved]
+            velocity = torch.zeros_like(state).view(num_rows, num_hypotheses, -1, 2)
             with torch.autocast(torch.device(self.device).type, dtype=torch.bfloat16, enabled=self.bf16):
-                velocity = part * network(state, level, wide, code).float()
-            return clean_from("v", velocity, state, torch.tensor(angle))
+                answer = network(asked.flatten(0, 1), level, wide, code).float()
+            velocity[:, is_moved] = (share * answer).view(asked.shape)
+            return clean_from("v", velocity.view(state.shape), state, torch.tensor(angle))
 
         def guided(clean: Tensor, angle: float) -> Tensor:
             if guide is None:
@@ -162,10 +176,24 @@ class GeneralModel:
         result = _SAMPLERS[self.sampler](denoise, start, even_angles(self.num_steps), guided)
         return result.cpu().view(num_rows, num_hypotheses, -1, 2)
 
+    def with_shares(self, share: float) -> "GeneralModel":
+        """The model whose network moves this share of the hypotheses, in past and future."""
+        return dataclasses.replace(self, share_past=share, share_future=share)
+
+    def moves(self, num_hypotheses: int) -> Tensor:
+        """Which hypotheses [K] the network moves anywhere; the others are samples of the bank."""
+        past, future = self._shared_out(num_hypotheses)
+        return (past + future) > 0
+
+    def _shared_out(self, num_hypotheses: int) -> tuple[Tensor, Tensor]:
+        """One for the hypotheses that the network moves in the past, and in the future, else zero: [K] each."""
+        number = torch.arange(num_hypotheses + 1, dtype=torch.float64)
+        past, future = (torch.diff((number * share).floor()) for share in (self.share_past, self.share_future))
+        return past, future
+
     def _part(self, num_hypotheses: int, context: ResidualContext) -> Tensor:
         """Factor of the network's answer [K, T, 1]: one for its share of the hypotheses, with a ramp at the origin."""
         steps = torch.arange(context.is_future.shape[1], device=context.mean.device) - (~context.is_future[0]).sum() + 0.5
         later = (0.5 + steps / _RAMP_STEPS).clamp(0.0, 1.0)
-        number = torch.arange(num_hypotheses + 1, dtype=torch.float64, device=steps.device)
-        past, future = (torch.diff((number * share).floor()) for share in (self.share_past, self.share_future))
+        past, future = (share.to(steps.device) for share in self._shared_out(num_hypotheses))
         return (past[:, None] * (1.0 - later) + future[:, None] * later)[..., None].float()

@@ -13,7 +13,8 @@ from torch import Tensor
 
 from cadence.bank.rows import scatter_hypotheses
 from cadence.constraints.obstacles import ObstacleConstraint
-from cadence.constraints.repair import repair
+from cadence.constraints.speed import exceeds
+from cadence.diffusion.feasible import Place, resampled, within_limits
 from cadence.diffusion.guidance import PaperCost, adam_guidance, clean_estimate_guidance
 from cadence.diffusion.noise import RowNoise
 from cadence.diffusion.sampler import even_angles, even_log_snr, sample_ddim, sample_ddpm, sample_dpmpp_2m
@@ -159,11 +160,27 @@ class SceneModel:
         positions = future_of(to_track(sampled.double(), inputs.pieces, self.config), self.config)
         positions = positions + last_m[:, None, None]
         if context.obstacles.count and self.sampling.is_repaired:
-            is_pinned = torch.zeros(positions.shape[:-1], dtype=torch.bool)
-            is_pinned[..., 0] = (inputs.pieces.start[:, :1] >= 0).expand(-1, num_hypotheses)
-            offset = context.datum_m[:, None, None]
-            positions, _ = repair(positions, context.obstacles, is_pinned, self.sampling.margin_m, offset_m=offset)
+            positions = self._repaired(positions, inputs.pieces, windows, team)
         return positions
+
+    def _repaired(self, positions: Tensor, pieces: Pieces, windows: WindowBatch, team: Team | None) -> Tensor:
+        """Tracks led around the obstacles at a speed that the target has; those that cannot be are drawn again from the others.
+
+        Where agents see each other a hypothesis is one of all of them, and none is drawn again for itself.
+        """
+        context = windows.required_context("SceneModel")
+        place = Place(context.obstacles, self.sampling.margin_m, context.datum_m[:, None, None])
+        is_first = torch.arange(positions.shape[2]) == 0
+        is_pinned = ((pieces.start[:, :1] >= 0) & is_first)[:, None].expand(positions.shape[:-1])
+        longest_m = self.config.max_step_m
+        moved, is_clear = within_limits(positions, place, is_pinned, longest_m, is_first.expand(positions.shape[:-1]))
+        is_kept = is_clear & ~exceeds(moved, longest_m)
+        is_mixed = is_kept.any(1) & ~is_kept.all(1)
+        if team is None and bool(is_mixed.any()):
+            chance = is_kept[is_mixed].double()
+            moved = moved.clone()
+            moved[is_mixed] = resampled(moved[is_mixed], chance / chance.sum(1, keepdim=True), windows.seeds[is_mixed])
+        return moved
 
     def _solved(self, denoise: Callable[[Tensor, float], Tensor], start: Tensor, stream: RowNoise, tracks: "_Tracks") -> Tensor:
         sampler, steps = self.sampling.sampler, self.sampling.num_steps

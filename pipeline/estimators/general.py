@@ -8,6 +8,7 @@ from typing import Any
 import torch
 
 from cadence.bank.bank import Bank
+from cadence.bank.plausible import plausible_speed
 from cadence.diffusion.gate import gated
 from cadence.diffusion.general import GeneralModel
 from cadence.errors import ConfigError, DeviceError
@@ -46,7 +47,11 @@ def fitted_model(model: GeneralModel, data: FittingData, is_gated: bool = True) 
 
 def _fitted(model: GeneralModel, samplings: Samplings, data: FittingData) -> Fitted:
     # The choices by hindsight are made without constraints: withheld detections obey them anyway.
-    fitted = dataclasses.replace(fitted_model(model, data, samplings.general.is_gated), guidance=samplings.guidance)
+    fitted = dataclasses.replace(
+        fitted_model(model, data, samplings.general.is_gated),
+        guidance=samplings.guidance,
+        plausible_speed_mps=plausible_speed(data.tracks, data.grid.step_s),
+    )
     return Fitted(fitted, _about(fitted))
 
 
@@ -64,6 +69,7 @@ def _about(model: GeneralModel) -> dict[str, Any]:
     bank = model.bank
     ratios = dataclasses.asdict(model.gate) if model.gate else {}
     return {
+        "plausible_speed_mps": model.plausible_speed_mps,
         "sampler": model.sampler,
         "num_steps": model.num_steps if model.network is not None else 0,
         "network": {"share_past": model.share_past, "share_future": model.share_future, **ratios},

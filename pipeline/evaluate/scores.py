@@ -6,6 +6,7 @@ belong together, and only whole agents (or episodes, or blocks of time of a sing
 """
 
 import itertools
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -20,12 +21,14 @@ from pipeline.arrays import Bools, Float64s, Int32s, Int64s
 METRICS = (
     "ade_m", "min_ade_m", "mean_error_m", "energy_score_m", "energy_score_fair_m", "trajectory_energy_score_m",
     "coverage_50", "coverage_90", "spread_m", "step_length_m", "true_step_length_m", "collision_share",
+    "fast_step_share", "fast_track_share",
 )  # fmt: skip
 """Columns of `Cells.value`.
 
 ade_m is the expected distance of a hypothesis; min_ade_m that of the hypothesis best over the agent's past (or future) in the
 window; trajectory_energy_score_m stands once per window, agent and side of the origin, at its first cell; step lengths
-from the step before; collision_share is NaN where no obstacles are known.
+from the step before; collision_share is NaN where no obstacles are known; fast_step_share is that of the hypotheses whose step
+to the cell is longer than hardly any true one, fast_track_share that of those with any such step, at the side's first cell.
 """
 
 PARTS = ("past", "between", "future", "final")
@@ -105,9 +108,16 @@ class ScoreRow:
 
 
 def score_cells(
-    found: HypothesisSet, windows: WindowBatch, truth_m: Tensor, is_known: Tensor, inside: Tensor | None = None
+    found: HypothesisSet,
+    windows: WindowBatch,
+    truth_m: Tensor,
+    is_known: Tensor,
+    inside: Tensor | None = None,
+    fastest_m: float = float("inf"),
 ) -> Cells:
     """Score one batch: truth_m [B, A, T, 2] relative to the datum, is_known [B, A, T], inside [B, K, A, T] in obstacles.
+
+    `fastest_m` is the length of a step that hardly any true one exceeds.
 
     Cells before an agent's first detection, of agents without detections, and of agents without hypotheses are left out.
     """
@@ -123,6 +133,9 @@ def score_cells(
     for side in (~is_future, is_future):
         _put_track_values(value, found.position_m, weight, truth_m, chosen & side)
     _put_step_lengths(value, found.position_m, weight, truth_m, chosen)
+    if math.isfinite(fastest_m):
+        for side in (~is_future, is_future):
+            _put_fast_steps(value, found.position_m, weight, chosen & side, fastest_m)
     if inside is not None:
         share = torch.einsum("bka,bkat->bat", weight, inside.double())
         value[..., METRICS.index("collision_share")] = share
@@ -139,6 +152,7 @@ def score_in_chunks(
     num_hypotheses: int,
     is_inside: IsInside | None = None,
     after_chunk: Callable[[int], object] | None = None,
+    fastest_m: float = float("inf"),
 ) -> Cells:
     """`score_cells` for any number of windows in bounded memory; windows without any cell to score are not drawn."""
     states = windows.num_agents * num_hypotheses * windows.num_steps
@@ -147,7 +161,7 @@ def score_in_chunks(
     for index in torch.split(asked, max(1, _MAX_STATES // states)):
         found = draw(index)
         inside = None if is_inside is None else is_inside(found.position_m, index)
-        part = score_cells(found, windows[index], truth_m[index], is_known[index], inside)
+        part = score_cells(found, windows[index], truth_m[index], is_known[index], inside, fastest_m)
         parts.append(replace(part, window=index.numpy().astype(np.int32)[part.window]))
         if after_chunk is not None:
             after_chunk(len(index))
@@ -194,7 +208,7 @@ def summarise(name: str, cells: Cells, groups: Int64s, seed: int = 0, num_resamp
     rows = []
     for part in PARTS:
         for metric in METRICS:
-            if metric == "trajectory_energy_score_m" and part not in ("past", "future"):
+            if metric in ("trajectory_energy_score_m", "fast_track_share") and part not in ("past", "future"):
                 continue  # it is that of the whole past, or the whole future
             rows.append(_row(name, part, "part", (None, None), metric, cells, groups, cells.is_in(part), rng, num_resamples))
     for part, by, distance in _distances(cells):
@@ -287,6 +301,19 @@ def _put_step_lengths(value: Tensor, position_m: Tensor, weight: Tensor, truth_m
     for name, steps in (("step_length_m", mean), ("true_step_length_m", true)):
         column = value[..., METRICS.index(name)]
         column[both] = steps[both[..., 1:]]
+
+
+def _put_fast_steps(value: Tensor, position_m: Tensor, weight: Tensor, chosen: Tensor, fastest_m: float) -> None:
+    """Which hypotheses come to a cell, or to any of a window's side, by a step that is too long."""
+    both = chosen[..., 1:] & chosen[..., :-1]
+    is_fast = (position_m.double().diff(dim=3).norm(dim=-1) > fastest_m) & both[:, None]  # [B, K, A, T - 1]
+    share = torch.einsum("bka,bkat->bat", weight, is_fast.double())
+    step_column = value[..., 1:, METRICS.index("fast_step_share")]
+    step_column[both] = share[both]
+    rows, agents = both.any(dim=-1).nonzero(as_tuple=True)
+    first = chosen[rows, agents].int().argmax(dim=-1)
+    any_fast = torch.einsum("bka,bka->ba", weight, is_fast.any(dim=-1).double())
+    value[rows, agents, first, METRICS.index("fast_track_share")] = any_fast[rows, agents]
 
 
 def detection_distances(windows: WindowBatch) -> tuple[Tensor, Tensor, Tensor]:

@@ -24,6 +24,7 @@ from pipeline.associations import Association, Sources, build_way_windows
 from pipeline.estimators.fitting import FittingData
 from pipeline.evaluate.joint import JointCells, JointScorer
 from pipeline.evaluate.matching import match_to_truth, matched_windows
+from pipeline.evaluate.motion import MotionLaws, true_motion
 from pipeline.evaluate.rivals import RIVALS
 from pipeline.evaluate.scores import Cells, Draw, IsInside, score_in_chunks
 from pipeline.evaluate.tables import OWN_NAME, ScoredMission, as_csv, as_json, as_markdown, headline, pool
@@ -156,15 +157,19 @@ def score_mission(directory: Path, config: EvaluateConfig, progress: Progress) -
         return _stored_hypotheses(stored, windows, index, num_hypotheses)
 
     collides = _collision_test(directory, windows)
+    truth = true_motion(scored, case.truth_m, case.is_known)
     with progress.bar(windows.batch.num_windows * (1 + len(config.rivals)), "evaluate", "window") as bar:
 
-        def score(draw: Draw, is_known: Tensor) -> tuple[Cells, JointCells]:
-            scorer = case.scorer()
-            watched = scorer.watch(draw) if case.is_joint else draw
-            cells = score_in_chunks(watched, scored, case.truth_m, is_known, num_hypotheses, collides, bar.update)
-            return cells, scorer.cells()
+        def score(draw: Draw, is_known: Tensor) -> tuple[Cells, JointCells, MotionLaws]:
+            scorer, motion = case.scorer(), truth.fresh()
+            watched = motion.watch(scorer.watch(draw) if case.is_joint else draw)
+            cells = score_in_chunks(
+                watched, scored, case.truth_m, is_known, num_hypotheses, collides, bar.update, truth.fastest_m
+            )
+            return cells, scorer.cells(), motion.laws()
 
-        own, own_joint = score(own_draw, case.is_known)
+        own_scored = score(own_draw, case.is_known)
+        own = own_scored[0]
         if not len(own):
             raise InputError(
                 f"{directory}: no step has both hypotheses and truth (truth samples at most {case.max_truth_gap_s:g} s apart); "
@@ -172,7 +177,7 @@ def score_mission(directory: Path, config: EvaluateConfig, progress: Progress) -
             )
         is_scored = torch.zeros(case.is_known.shape[:2], dtype=torch.bool)
         is_scored[torch.from_numpy(own.window.astype(np.int64)), torch.from_numpy(own.agent.astype(np.int64))] = True
-        found = {OWN_NAME: (own, own_joint)}
+        found: dict[str, tuple[Cells, JointCells, MotionLaws]] = {OWN_NAME: own_scored}
         for name in config.rivals:
             draw = _rival_draw(RIVALS[name](case.fitting), windows.batch, num_hypotheses)
             found[name] = score(draw, case.is_known & is_scored[..., None])
@@ -187,8 +192,10 @@ def score_mission(directory: Path, config: EvaluateConfig, progress: Progress) -
         num_hypotheses=num_hypotheses,
         max_truth_gap_s=case.max_truth_gap_s,
         num_unscored=int((is_asked & ~is_scored).sum()),
-        cells={name: cells for name, (cells, _) in found.items()},
-        joint={name: joint for name, (_, joint) in found.items()} if case.is_joint else {},
+        cells={name: cells for name, (cells, _, _) in found.items()},
+        joint={name: joint for name, (_, joint, _) in found.items()} if case.is_joint else {},
+        motion={name: laws for name, (_, _, laws) in found.items()},
+        true_motion=truth.laws(),
         gospa_cutoff_m=case.cutoff_m if case.is_joint else None,
         is_matched=case.is_matched,
     )

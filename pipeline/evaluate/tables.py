@@ -3,7 +3,7 @@
 import dataclasses
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -11,6 +11,7 @@ import numpy as np
 
 from pipeline.arrays import Int64s
 from pipeline.evaluate.joint import JOINT_METRICS, JointCells, block_of, summarise_joint
+from pipeline.evaluate.motion import MotionLaws, MotionSample, motion_rows
 from pipeline.evaluate.scores import PARTS, Cells, ScoreRow, energy_ratio, groups_of, summarise
 from pipeline.plain_rows import rows_as_csv, without_nan
 
@@ -23,6 +24,9 @@ _PART_METRICS = {
     "energy_score_m": "energy score m", "trajectory_energy_score_m": "trajectory energy m", "ade_m": "ADE m",
     "min_ade_m": "minADE m", "mean_error_m": "error of mean m", "coverage_50": "in 50 %", "coverage_90": "in 90 %",
     "spread_m": "spread m", "step_length_m": "step m", "true_step_length_m": "true step m", "collision_share": "collisions",
+}  # fmt: skip
+_MOTION_TITLES = {
+    "speed_w1_mps": "speed m/s", "acceleration_w1_mps2": "acceleration m/s²", "turn_w1_deg": "turn a step °",
 }  # fmt: skip
 _JOINT_TITLES = {
     "joint_energy_score_m": "joint energy m", "joint_min_ade_m": "joint minADE m", "gospa_m": "GOSPA m",
@@ -44,6 +48,7 @@ class ScoredMission:
 
     cells         by estimator, OWN_NAME first; all in the same order
     num_unscored  (window, agent) pairs with truth and detections but without hypotheses: these are spared
+    motion, true_motion  how hypotheses move, by estimator, and how the truth does
     joint         by estimator, scores of all agents together; empty for one agent
     is_matched    detections are of unknown origin: agents were matched to those of the truth
     """
@@ -59,6 +64,8 @@ class ScoredMission:
     joint: dict[str, JointCells] = field(default_factory=dict)
     gospa_cutoff_m: float | None = None
     is_matched: bool = False
+    motion: dict[str, MotionLaws] = field(default_factory=dict)
+    true_motion: MotionLaws = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -109,6 +116,7 @@ def pool(missions: Sequence[ScoredMission], num_resamples: int, seed: int) -> Sc
     own = cells[names[0]]
     rows = [row for name in names for row in summarise(name, cells[name], groups, seed, num_resamples)]
     rows += _joint_rows(missions, names, num_resamples, seed)
+    rows += _motion_rows(missions, names)
     ratios = []
     for rival in names[1:]:
         for part in PARTS:
@@ -143,6 +151,21 @@ def _joint_rows(missions: Sequence[ScoredMission], names: Sequence[str], num_res
     return rows
 
 
+def _motion_rows(missions: Sequence[ScoredMission], names: Sequence[str]) -> Iterator[ScoreRow]:
+    """Laws of motion of all missions together; of missions whose targets are of one kind, as in one folder they should be."""
+    measured = [mission for mission in missions if mission.motion]
+    if not measured:
+        return
+
+    def together(of: Callable[[ScoredMission], MotionLaws]) -> MotionLaws:
+        parts = [of(mission) for mission in measured]
+        return {part: MotionSample.concatenate([laws[part] for laws in parts]) for part in parts[0]}
+
+    truth = together(lambda mission: mission.true_motion)
+    for name in names:
+        yield from motion_rows(name, together(lambda mission, name=name: mission.motion[name]), truth)  # type: ignore[misc]
+
+
 def as_json(report: ScoreReport) -> str:
     """scores.json; NaN becomes null."""
     return json.dumps(without_nan(dataclasses.asdict(report)), indent=1) + "\n"
@@ -158,6 +181,7 @@ def as_markdown(report: ScoreReport) -> str:
     lines = ["# Scores", "", *_preface(report)]
     for part in PARTS:
         lines += _part_table(report, part)
+    lines += _motion_table(report)
     lines += _ratio_table(report)
     lines += _joint_tables(report)
     for (part, by), title in _SLICE_TITLES.items():
@@ -218,6 +242,31 @@ def _part_table(report: ScoreReport, part: str) -> list[str]:
         rows = [found.get((estimator, name)) for name in shown]
         cells = [(_with_interval if name == "energy_score_m" else _value)(row) for name, row in zip(shown, rows, strict=True)]
         lines.append(_line([estimator, *cells, str(next((row.num_cells for row in rows if row), 0))]))
+    return [*lines, ""]
+
+
+def _motion_table(report: ScoreReport) -> list[str]:
+    """Whether the tracks could have been driven: what single steps do not show."""
+    shares = ("fast_step_share", "fast_track_share")
+    found = {
+        (row.estimator, row.part, row.metric): row
+        for row in report.rows
+        if row.by == "motion" or (row.by == "part" and row.metric in shares and row.part in ("past", "future"))
+    }
+    if not found:
+        return []
+    titles = {"fast_step_share": "steps too fast", "fast_track_share": "tracks with such a step", **_MOTION_TITLES}
+    lines = [
+        "## Motion",
+        "",
+        "Too fast: longer than all true steps but one in a thousand. Distances: Wasserstein's, to the truth's law.",
+        "",
+    ]
+    lines += [_line(["estimator", "", *titles.values()]), _line(["---"] * (len(titles) + 2))]
+    for estimator in _ordered(name for name, _, _ in found):
+        for part in ("past", "future"):
+            cells = [_value(found.get((estimator, part, metric))) for metric in titles]
+            lines.append(_line([estimator, part, *cells]))
     return [*lines, ""]
 
 

@@ -29,7 +29,7 @@ def line() -> WindowBatch:
 
 WINDOWS = line()
 BANK = Bank().fit(WINDOWS.detections, 1.0)
-MODEL = GeneralModel(BANK, network(0.2))
+MODEL = GeneralModel(BANK, network(0.2), is_smooth=False)
 POSTERIOR = BANK.posterior(WINDOWS, NUM)
 LENGTH_M = BANK.length_m(1.0)
 PINNED = (TIMES + 15).long()
@@ -82,7 +82,7 @@ def test_samples_obey_the_obstacles_of_the_windows() -> None:
     """`sample` is guidance, repair and weights in one; without a context or with mode "none" there is nothing to obey."""
     here = WINDOWS.with_context(Context(DATUM, obstacles=OBSTACLES))
     found = MODEL.sample(here, NUM)
-    moved, weight, _ = LIMITS.finish(sampled(LIMITS), BANK.posterior(WINDOWS, 1).sigma_m, LENGTH_M)
+    moved, weight, _ = LIMITS.finish(sampled(LIMITS), POSTERIOR.sigma_m, LENGTH_M)
     assert torch.equal(found.position_m[:, :, 0], moved) and torch.equal(found.weight, weight)
     assert num_inside(found.position_m[:, :, 0]) == 0
     plain = MODEL.sample(WINDOWS, NUM)

@@ -12,6 +12,7 @@ from cadence.bank.bank import Bank
 from cadence.bank.fitting import FLOOR_STEPS
 from cadence.diffusion import general
 from cadence.diffusion.general import GeneralModel
+from cadence.diffusion.transport import bend_of
 from cadence.network.residual import ResidualNetwork, ResidualNetworkConfig
 from cadence.types import Detections, WindowBatch
 
@@ -63,7 +64,7 @@ def test_an_answer_of_zero_gives_the_bank_back(num_steps: int) -> None:
 def test_a_constant_answer_moves_by_its_integral_over_the_angle(num_steps: int) -> None:
     """By hand: dx/dangle = c from pi/2 to 0 adds -c pi / 2, in bank sigmas, to the hypotheses that are the network's."""
     bias = 0.4
-    model = GeneralModel(BANK, network(0.0, bias), num_steps=num_steps, share_past=1.0, share_future=0.25)
+    model = GeneralModel(BANK, network(0.0, bias), num_steps=num_steps, share_past=1.0, share_future=0.25, is_smooth=False)
     shift = in_sigmas(sampled(model), BANK.posterior(WINDOWS, NUM).sample_m) / (-bias * math.pi / 2)
     part = shift[0, :, :, 0]
     torch.testing.assert_close(shift, part[..., None].expand_as(shift), atol=1e-4, rtol=0)
@@ -78,7 +79,7 @@ def test_a_constant_answer_moves_by_its_integral_over_the_angle(num_steps: int) 
 
 @pytest.mark.parametrize(("past", "future", "untouched"), [(1.0, 0.0, slice(20, None)), (0.0, 1.0, slice(0, 12))])
 def test_where_the_share_is_zero_the_bank_stays(past: float, future: float, untouched: slice) -> None:
-    model = dataclasses.replace(MODEL, share_past=past, share_future=future)
+    model = dataclasses.replace(MODEL, share_past=past, share_future=future, is_smooth=False)
     shift = in_sigmas(sampled(model), BANK.posterior(WINDOWS, NUM).sample_m).abs()
     assert shift[:, :, untouched].max() < 1e-5 < 0.1 < shift.max()
 
@@ -149,7 +150,7 @@ def test_agents_that_were_not_seen_get_nothing() -> None:
 @pytest.mark.parametrize("sampler", ["rotation", "ddim", "dpmpp"])
 def test_guides_see_metres_and_have_the_last_word_on_clean_estimates(sampler: str) -> None:
     """A guide that leaves things alone changes nothing; one that knows the answer gets it."""
-    plain = dataclasses.replace(MODEL, sampler=sampler)
+    plain = dataclasses.replace(MODEL, sampler=sampler, is_smooth=False)
     rows_seen: list[slice] = []
     sigma = BANK.posterior(WINDOWS, 1).sigma_m
 
@@ -165,6 +166,15 @@ def test_guides_see_metres_and_have_the_last_word_on_clean_estimates(sampler: st
     slow = dataclasses.replace(plain, num_steps=24)
     led = slow.denoised(posterior, WINDOWS, lambda p, s, r: target[r].expand_as(p))
     assert in_sigmas(led, target).abs().max() < (0.4 if sampler == "rotation" else 1e-3)
+
+
+def test_what_the_network_adds_is_smooth() -> None:
+    """A network of chance shakes the tracks; what is left of that goes as far, but bends half as much."""
+    raw = dataclasses.replace(MODEL, is_smooth=False)
+    bank = BANK.posterior(WINDOWS, NUM).sample_m
+    smooth, rough = (sampled(model) for model in (MODEL, raw))
+    assert bend_of(smooth).mean() < 0.6 * bend_of(rough).mean()
+    assert in_sigmas(smooth, bank).square().mean() > 0.3 * in_sigmas(rough, bank).square().mean()
 
 
 def test_fit_fits_the_bank_and_nothing_else() -> None:

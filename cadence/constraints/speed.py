@@ -1,0 +1,92 @@
+"""A speed that no step of a track exceeds, kept exactly: the nearest track whose steps are all short enough."""
+
+import torch
+from torch import Tensor
+
+_ROUNDS = 60
+_SLACK = 1e-9
+
+
+def exceeds(position_m: Tensor, longest_m: float) -> Tensor:
+    """Whether a step of the tracks [..., T, 2] is longer than `longest_m` [...]; a rounding error is not."""
+    is_long: Tensor = position_m.diff(dim=-2).norm(dim=-1) > longest_m * (1.0 + 1e-6)
+    return is_long.any(dim=-1)
+
+
+def limit_steps(position_m: Tensor, is_pinned: Tensor, longest_m: float) -> tuple[Tensor, Tensor]:
+    """Tracks whose steps are at most so long, and which of them could be had.
+
+    Between two pinned steps it is the projection onto the tracks that keep both ends and the limit (Dykstra's alternating
+    projections: Boyle, Dykstra 1986), drawn towards the straight way by what is left after a fixed number of rounds: the limit
+    holds exactly. Before the first and after the last pinned step every step is shortened by itself.
+
+    Args:
+        position_m: [N, T, 2] metres, float64.
+        is_pinned: [N, T] bool, steps that stay exactly where they are; at least one a track.
+        longest_m: the limit.
+
+    Returns:
+        Tracks [N, T, 2], those that kept the limit unchanged, and whether they keep it now [N]: two pinned steps may be further
+        apart than the limit allows, and such a track is left as it is between them.
+    """
+    is_long = exceeds(position_m, longest_m)
+    moved = position_m.clone()
+    if bool(is_long.any()):
+        moved[is_long] = _limited(position_m[is_long], is_pinned[is_long], longest_m * (1.0 - _SLACK))
+    return moved, ~exceeds(moved, longest_m)
+
+
+def _limited(position_m: Tensor, is_pinned: Tensor, longest_m: float) -> Tensor:
+    step_m = position_m.diff(dim=1)
+    legs = _Legs(is_pinned, step_m)
+    found, correction = step_m, torch.zeros_like(step_m)
+    for _ in range(_ROUNDS):
+        short = _shortened(found + correction, longest_m)
+        correction = found + correction - short
+        found = legs.closed(short)
+    found = torch.where(legs.is_closed[..., None], legs.drawn_straight(found, longest_m), _shortened(step_m, longest_m))
+    first = is_pinned.to(torch.int8).argmax(dim=1)
+    way_m = torch.nn.functional.pad(found.cumsum(dim=1), (0, 0, 1, 0))
+    rows = torch.arange(len(found))
+    track = way_m + (position_m[rows, first] - way_m[rows, first])[:, None]
+    return torch.where(is_pinned[..., None], position_m, track)
+
+
+def _shortened(step_m: Tensor, longest_m: float) -> Tensor:
+    length = step_m.norm(dim=-1, keepdim=True)
+    shortened: Tensor = step_m * (longest_m / length.clamp_min(longest_m))
+    return shortened
+
+
+class _Legs:
+    """The stretches between pinned steps of N tracks: a number for each of the T - 1 steps, and what they must add up to."""
+
+    def __init__(self, is_pinned: Tensor, step_m: Tensor) -> None:
+        number = is_pinned.cumsum(dim=1)
+        self.leg = number[:, :-1]
+        self.is_closed = (self.leg > 0) & (self.leg < number[:, -1:])
+        self.num_legs = int(number.max()) + 1
+        count = torch.zeros(len(step_m), self.num_legs, dtype=step_m.dtype)
+        count.scatter_add_(1, self.leg, torch.ones_like(self.leg, dtype=step_m.dtype))
+        self.count = count.gather(1, self.leg)[..., None]
+        self.mean_m = self._mean(step_m)
+
+    def _mean(self, step_m: Tensor) -> Tensor:
+        """Mean step of each step's leg [N, T - 1, 2]."""
+        index = self.leg[..., None].expand(-1, -1, 2)
+        total = torch.zeros(len(step_m), self.num_legs, 2, dtype=step_m.dtype).scatter_add_(1, index, step_m)
+        return total.gather(1, index) / self.count
+
+    def closed(self, step_m: Tensor) -> Tensor:
+        """The nearest steps that lead from each pinned step to the next."""
+        return torch.where(self.is_closed[..., None], step_m + self.mean_m - self._mean(step_m), step_m)
+
+    def drawn_straight(self, step_m: Tensor, longest_m: float) -> Tensor:
+        """The steps drawn towards their leg's mean step as far as none is too long; as they are where that cannot help."""
+        away = step_m - self.mean_m
+        along, square = (self.mean_m * away).sum(-1), away.square().sum(-1).clamp_min(1e-300)
+        room = longest_m**2 - self.mean_m.square().sum(-1)
+        share = ((along.square() + square * room).clamp_min(0.0).sqrt() - along) / square
+        least = torch.ones(len(step_m), self.num_legs, dtype=step_m.dtype)
+        least.scatter_reduce_(1, self.leg, share.clamp(0.0, 1.0), "amin")
+        return torch.where(room[..., None] >= 0.0, self.mean_m + least.gather(1, self.leg)[..., None] * away, step_m)

@@ -1,0 +1,66 @@
+"""The speed limit: kept exactly, with the ends where they were, by the nearest track; what cannot keep it is said."""
+
+import itertools
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch import Tensor
+
+from cadence.constraints.speed import exceeds, limit_steps
+
+
+def tracks(num: int = 50, steps: int = 30, seed: int = 0) -> Tensor:
+    """Random walks with a jump here and there."""
+    generator = torch.Generator().manual_seed(seed)
+    step = torch.randn(num, steps, 2, generator=generator, dtype=torch.float64)
+    is_jump = torch.rand(num, steps, 1, generator=generator, dtype=torch.float64) < 0.05
+    return torch.where(is_jump, 8.0 * step, step).cumsum(dim=1)
+
+
+def pins(num: int, steps: int, *indices: int) -> Tensor:
+    pinned = torch.zeros(num, steps, dtype=torch.bool)
+    pinned[:, list(indices)] = True
+    return pinned
+
+
+def test_a_track_that_keeps_the_limit_is_bit_identical() -> None:
+    track = tracks()
+    moved, is_kept = limit_steps(track, pins(50, 30, 0, 29), 1e6)
+    assert torch.equal(moved, track) and bool(is_kept.all())
+
+
+@given(st.integers(0, 10_000), st.sets(st.integers(0, 29), min_size=1, max_size=6))
+def test_the_limit_holds_and_pinned_steps_stay_where_that_can_be(seed: int, pinned: set[int]) -> None:
+    track, longest = tracks(20, seed=seed), 3.0
+    where = pins(20, 30, *pinned)
+    moved, is_kept = limit_steps(track, where, longest)
+    assert torch.equal(moved[where], track[where])
+    assert torch.equal(is_kept, ~exceeds(moved, longest))
+    order = sorted(pinned)
+    can = torch.ones(20, dtype=torch.bool)
+    for first, second in itertools.pairwise(order):
+        can &= (track[:, second] - track[:, first]).norm(dim=-1) <= longest * (second - first) * (1 - 1e-6)
+    assert bool((is_kept | ~can).all())
+
+
+def test_one_jump_is_spread_over_its_neighbours_by_hand() -> None:
+    """Four steps of which one is 4 long lead 4 east; the nearest with none over 2 gives 1 to each of the others... in part."""
+    track = torch.tensor([[[0.0, 0.0], [0.0, 0.0], [4.0, 0.0], [4.0, 0.0]]], dtype=torch.float64)
+    moved, is_kept = limit_steps(track, pins(1, 4, 0, 3), 2.0)
+    assert bool(is_kept) and moved[0, :, 0].tolist() == pytest.approx([0.0, 1.0, 3.0, 4.0], abs=1e-6)
+
+
+def test_free_ends_are_only_shortened() -> None:
+    track = torch.tensor([[[0.0, 0.0], [0.0, 6.0], [1.0, 6.0], [9.0, 6.0]]], dtype=torch.float64)
+    moved, is_kept = limit_steps(track, pins(1, 4, 1), 2.0)
+    assert bool(is_kept) and moved[0].tolist() == [
+        pytest.approx(place) for place in ([0.0, 4.0], [0.0, 6.0], [1.0, 6.0], [3.0, 6.0])
+    ]
+
+
+def test_two_pins_too_far_apart_are_not_kept_and_the_rest_is() -> None:
+    track = torch.tensor([[[0.0, 0.0], [9.0, 0.0], [9.0, 9.0]]], dtype=torch.float64)
+    moved, is_kept = limit_steps(track, pins(1, 3, 0, 1), 2.0)
+    assert not bool(is_kept) and moved[0, 2].tolist() == pytest.approx([9.0, 2.0])
