@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 
 import pytest
+from fixtures.batch import SETTINGS
 from fixtures.line_logs import straight_line, write_log
 
 import pipeline.batch.remote as module
@@ -19,12 +20,12 @@ from pipeline.stores.objects import list_folder, read_bytes, remove, write_file
 
 pytest_plugins = ("fixtures.s3",)
 QUIET = Progress(quiet=True)
-SETTINGS = ["infer.checkpoint=none", "infer.num_hypotheses=4", "infer.grid.stride_steps=32", "export.tick_s=10"]
 STAGES = ("ingest", "extract", "infer", "export", "report")
 
 
 def config(*more):
-    return stage_config(RunConfig, None, None, [*SETTINGS, *more])
+    tiny = [f"{name}={value}" for name, value in SETTINGS.items()]
+    return stage_config(RunConfig, None, None, [*tiny, "export.tick_s=10", *more])
 
 
 @pytest.fixture
