@@ -7,8 +7,9 @@ import os
 import signal
 import threading
 from collections import deque
-from collections.abc import Generator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from dataclasses import dataclass
+from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import ForkServerContext, ForkServerProcess
 from types import FrameType
@@ -117,7 +118,8 @@ def _start_once(context: ForkServerContext, run: RunTask, task: LogTask) -> _Wor
     before = {name: os.environ.get(name) for name in _ONE_THREAD}
     os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))  # libraries read it when they are first imported
     try:
-        process.start()
+        with _interrupts_held():
+            process.start()
     except (OSError, EOFError) as error:
         reason = getattr(error, "strerror", None) or "the process that starts them ended"
         raise DeviceError(f"no worker process can be started ({reason}); use fewer --workers") from error
@@ -130,6 +132,17 @@ def _start_once(context: ForkServerContext, run: RunTask, task: LogTask) -> _Wor
     return worker
 
 
+@contextlib.contextmanager
+def _interrupts_held() -> Iterator[None]:
+    """What is started meanwhile never hears Ctrl-C, which reaches every process of a terminal; ours is heard afterwards."""
+    resource_tracker.ensure_running()  # where it starts, it lets interrupts through again
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
 def _stop_all(workers: Sequence[_Worker]) -> None:
     """Ask all to stop, so that they clear up, and then wait."""
     for worker in workers:
@@ -140,7 +153,7 @@ def _stop_all(workers: Sequence[_Worker]) -> None:
 
 def _work(connection: Connection, run: RunTask) -> None:
     """The life of a worker: tasks until the connection is closed."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches every process of the terminal; the parent decides
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # of the terminal's processes the parent decides what Ctrl-C means
     signal.signal(signal.SIGTERM, _leave)
     threading.Thread(target=_leave_with_parent, daemon=True).start()
     progress = RelayedProgress(tell=connection.send)

@@ -96,3 +96,18 @@ def test_a_killed_process_that_forks_workers_costs_no_log():
         if len(outcomes) == 1:
             os.kill(server._forkserver_pid, signal.SIGKILL)
     assert [outcome.exit_code for outcome in outcomes] == [0, 0, 0]
+
+
+def tell_blocked_signals(task, progress):
+    return LogOutcome(task, message=",".join(number.name for number in signal.pthread_sigmask(signal.SIG_BLOCK, [])))
+
+
+def test_workers_never_hear_an_interrupt_and_we_do():
+    """Not even one that comes while they and the process that forks them are only starting."""
+    multiprocessing.forkserver._forkserver._stop()  # others may have started it
+    (outcome,) = run_in_processes(bare_tasks(1), tell_blocked_signals, lambda task, told: None, 1)
+    assert "SIGINT" in outcome.message.split(",")
+    with pytest.raises(KeyboardInterrupt), local._interrupts_held():
+        os.kill(os.getpid(), signal.SIGINT)
+        held = signal.sigpending()
+    assert held == {signal.SIGINT}
