@@ -6,9 +6,10 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 SOURCES := cli.py cadence pipeline schemas tests benchmarks docs/generate.py
 DEMO := out/demo
+COVERAGE := out/coverage.json
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test check fix docs bench clean
+.PHONY: help setup demo test lint check ray fix docs bench clean
 
 help:  ## Show this list.
 	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 10
@@ -35,14 +36,21 @@ demo: $(STAMP)  ## Simulate a mission, run the whole pipeline on it, say where t
 	@echo "  $(BIN)/cadence info YOUR_LOG.mcap"
 	@echo "  $(BIN)/cadence run YOUR_LOG.mcap --out out/mine"
 
-test: $(STAMP)  ## Run all tests.
-	$(BIN)/python -m pytest
+test: lint  ## Lint, types, all tests, and no package less tested than before: what continuous integration runs.
+	$(BIN)/python -m pytest --cov --cov-report=json:$(COVERAGE)
+	$(BIN)/python tests/coverage_floors.py $(COVERAGE)
 
-check: $(STAMP)  ## Lint, format check, types, fast tests.
+lint: $(STAMP)  ## Lint, format check, types.
 	$(BIN)/ruff check $(SOURCES)
 	$(BIN)/ruff format --check $(SOURCES)
 	$(BIN)/mypy
+
+check: lint  ## Lint, format check, types, fast tests.
 	$(BIN)/python -m pytest -q tests/test_layers.py tests/test_api.py tests/test_docs.py tests/test_cli.py tests/pipeline tests/cadence
+
+ray: $(STAMP)  ## Install Ray, and test its engine on a Ray of this machine.
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev,ray]'
+	$(BIN)/python -m pytest tests/pipeline/batch/test_ray_engine.py tests/pipeline/test_kill.py -k ray
 
 fix: $(STAMP)  ## Let ruff mend what it can, and format.
 	$(BIN)/ruff check --fix $(SOURCES)
@@ -56,5 +64,5 @@ bench: $(STAMP)  ## Run every benchmark script; each prints its section of a pag
 		echo "== $$name"; $(BIN)/python -m benchmarks.$$name || exit 1; done
 
 clean:  ## Remove what was built and written here; keeps .venv.
-	rm -rf build dist out *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	rm -rf build dist out *.egg-info .coverage* .mypy_cache .ruff_cache .pytest_cache .hypothesis
 	find . -name __pycache__ -not -path './$(VENV)/*' -prune -exec rm -rf {} +
