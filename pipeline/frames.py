@@ -52,6 +52,15 @@ def to_geodetic(frame: Frame, x_m: Float64s, y_m: Float64s) -> tuple[Float64s, F
     return np.asarray(latitude, dtype=np.float64), np.asarray(longitude, dtype=np.float64)
 
 
+def from_earth_centred(x_m: Float64s, y_m: Float64s, z_m: Float64s) -> tuple[Float64s, Float64s, Float64s]:
+    """latitude_deg, longitude_deg and height_m above the ellipsoid of earth-centred positions [N] (ECEF, WGS 84)."""
+    transformer = Transformer.from_crs("EPSG:4978", "EPSG:4979", always_xy=True)
+    longitude, latitude, height_m = transformer.transform(x_m, y_m, z_m)
+    return (
+        np.asarray(latitude, dtype=np.float64), np.asarray(longitude, dtype=np.float64), np.asarray(height_m, dtype=np.float64)
+    )  # fmt: skip
+
+
 @functools.cache  # building one takes milliseconds
 def _transformer(frame: Frame) -> Transformer:
     if not frame.is_georeferenced:

@@ -19,7 +19,9 @@ from cadence.errors import ConfigError, ImplausibleInputError, InputError, Nothi
 from pipeline.arrays import Objects
 from pipeline.catalogue import open_catalogued_log, read_catalogue
 from pipeline.extract.collapse import Collapsed, collapse
+from pipeline.extract.fill_ins import without_fill_ins
 from pipeline.extract.identity import without_false_names
+from pipeline.extract.joined import check_joined
 from pipeline.extract.mission_clock import on_one_clock
 from pipeline.extract.obstacle_sources import ObstacleSources, collect_obstacles
 from pipeline.extract.placement import Placing, bring_together, in_enu, mission_frame, place
@@ -34,6 +36,7 @@ from pipeline.extract.summary import summarise, tell
 from pipeline.extract.thinning import ThinningConfig, is_seen, noise
 from pipeline.extract.transform_messages import LogTransforms
 from pipeline.extract.transforms import Limits
+from pipeline.extract.units import in_true_units
 from pipeline.logs.reader import MissionLog
 from pipeline.manifest import StageResult, run_stage
 from pipeline.mapping.sources import SourceConfig
@@ -130,7 +133,7 @@ def write_tables(log: MissionLog, folder: Path, config: ExtractConfig, progress:
         channels = selected_channels(log.channels, config.topics)
         readers = select_readers(stated, config.suggest, config.thinning, channels)
         counts = read_positions(log, readers, progress, *_cut_ns(log, config))
-        rows, frame = _rows_in_frame(readers, config, counts, suspicions, transforms)
+        rows, frame = _rows_in_frame(log, readers, config, counts, suspicions, transforms)
     counts["unselected_topics"] = len({c.topic for c in log.channels} - {c.topic for c in channels})
     detections = collapse(_with_default_sigma(rows["detections"], config.default_sigma_m), config.simultaneity_s)
     counts["collapsed"] = len(rows["detections"]) - len(detections.positions)
@@ -179,19 +182,23 @@ def _cut_ns(log: MissionLog, config: ExtractConfig) -> tuple[int | None, int | N
 
 
 def _rows_in_frame(
-    readers: Sequence[ChannelReader], config: ExtractConfig, counts: Counter[str], suspicions: Suspicions,
+    log: MissionLog, readers: Sequence[ChannelReader], config: ExtractConfig, counts: Counter[str], suspicions: Suspicions,
     transforms: LogTransforms,
 ) -> tuple[dict[str, Positions], Frame]:  # fmt: skip
     """The rows of every role, placed in the mission frame and thinned, and that frame."""
     parts = {role: _numbered([(reader, reader.finish()) for reader in readers if reader.role == role]) for role in ROLES}
-    timed, clock = on_one_clock(without_set_back(parts, suspicions), suspicions)
-    rows = {role: _columns(timed[role], counts) for role in ROLES}
+    parts = without_set_back(parts, suspicions)
+    timed, clock = on_one_clock(parts, suspicions)
+    rows = {role: _columns(_in_place(role, parts[role], timed[role], suspicions), counts) for role in ROLES}
     primary = "truth" if config.thinning.enabled and config.thinning.thin_from == "truth" else "detections"
-    _check_any(primary, rows[primary], counts)
+    _check_any(primary, rows[primary], counts, suspicions)
     rows = without_unjoined(rows, primary, suspicions)
     placing = Placing(config.frame, Limits(config.max_extrapolation_s, config.max_transform_gap_s))
-    rows = bring_together(rows, primary, placing, partial(transforms.read, clock), counts)
-    _check_any(primary, rows[primary], counts)
+    read_tree = partial(transforms.read, clock)
+    if config.frame is None:
+        check_joined(rows[primary], primary, transforms, read_tree, log, suspicions)
+    rows = bring_together(rows, primary, placing, read_tree, counts)
+    _check_any(primary, rows[primary], counts, suspicions)
     rows = {role: in_enu(positions) for role, positions in rows.items()}
     frame = mission_frame(rows[primary], [rows[role] for role in ROLES if role != primary], config.datum)
     rows = {role: _placed(role, rows[role], frame, counts, transforms.apart) for role in ROLES}
@@ -226,10 +233,20 @@ def _numbered(parts: Sequence[tuple[ChannelReader, Positions]]) -> list[tuple[Ch
     ]
 
 
-def _check_any(role: str, rows: Positions, counts: Counter[str]) -> None:
+def _in_place(
+    role: str, parts: Sequence[tuple[ChannelReader, Positions]], timed: Sequence[Positions], suspicions: Suspicions
+) -> list[Positions]:
+    """The rows of each reader, whose times are mended, in true units and without fill-ins."""
+    found = [in_true_units(reader.source, role, rows, suspicions) for (reader, _), rows in zip(parts, timed, strict=True)]
+    return [without_fill_ins(rows, role, suspicions) for rows in found]
+
+
+def _check_any(role: str, rows: Positions, counts: Counter[str], suspicions: Suspicions) -> None:
     if len(rows):
         return
-    if counts["no_transform"]:
+    if suspicions:
+        reason = f"nothing that can be meant is left of the {role}: {'; '.join(few(suspicions.lines()))}"
+    elif counts["no_transform"]:
         reason = (
             f"for none of the {role} the log has a transform near enough in time; "
             "raise extract.max_extrapolation_s and extract.max_transform_gap_s, or check the stamps"

@@ -106,7 +106,10 @@ class _Reader:
         x, y, z = (_number(translation, axis) for axis in "xyz")
         turn = [_number(rotation, axis) for axis in "xyzw"]
         norm = math.hypot(*turn)
-        if not (math.isfinite(x + y + z) and _MIN_NORM < norm < math.inf and parent and child and parent != child):
+        if norm <= _MIN_NORM:
+            self.counts["zero_rotations"] += 1
+            return
+        if not (math.isfinite(x + y + z) and norm < math.inf and parent and child and parent != child):
             raise ValueError("no transform")
         samples = self.samples.setdefault((parent, child), _Samples())
         samples.times.append(stamp_ns(stamp) or log_time_ns)
@@ -118,6 +121,7 @@ _MIN_NORM = 1e-6
 
 
 _FAULTS = {
+    "zero_rotations": "transforms have a rotation of zeros, which is none, and were skipped",
     "bad_transforms": "transforms lack a field, or are no rotation and translation, and were skipped",
     "undecodable_transforms": "messages with transforms cannot be decoded and were skipped",
 }
@@ -148,15 +152,18 @@ class LogTransforms:
             **{name: both[name] for name in ("transformed", "no_transform", *_FAULTS)},
         }
 
+    def faults(self) -> list[tuple[str, int]]:
+        """What is wrong with transforms, in words, and with how many."""
+        return [(meaning, self.counts[name]) for name, meaning in _FAULTS.items() if self.counts[name]]
+
     def tell(self) -> None:
         """One line for each kind of thing that is wrong."""
         for problem in self._tree.problems if self._tree is not None else ():
             self._progress.note(f"extract: {problem}")
         if self.apart:
             self._progress.note(f"extract: no transform joins the detections' frame to {', '.join(sorted(self.apart))}")
-        for name, meaning in _FAULTS.items():
-            if self.counts[name]:
-                self._progress.note(f"extract: {self.counts[name]} {meaning}")
+        for meaning, count in self.faults():
+            self._progress.note(f"extract: {count} {meaning}")
 
 
 def read_transforms(log: MissionLog, clock: MissionClock, counts: Counter[str], progress: Progress) -> TransformTree:

@@ -24,6 +24,10 @@ _CHECKED = (
 )  # fmt: skip
 
 
+Unit = Literal["deg", "rad", "1e-7 deg", "m", "ecef"]
+"""What latitude and longitude (the first three), or x, y and z, are in."""
+
+
 class ChannelLike(Protocol):
     """What a mapping needs to know of a channel (`pipeline.logs.reader.Channel` has more)."""
 
@@ -49,6 +53,8 @@ class SourceConfig:
     sensor, sensor_path  who saw it
     x, y, z     message paths of a position in metres
     latitude, longitude, altitude   message paths of a position in degrees (and metres), instead of x, y and z
+    unit        of latitude and longitude: "deg", "rad" or "1e-7 deg"; of x, y and z: "m" (of a plane) or "ecef" (from
+                the earth's centre); default: degrees or metres, but for what can hardly be meant as such
     where       conditions on fields of the message, all of which must hold: "fix_type >= 3 && lat_lon_valid"; the preset's are
                 used where nothing is stated, and "" means none
     covariance  message path of 1, 4, 9 or 36 numbers (a variance, or rows of a matrix), 6 or 21 (an upper triangle) or 3 (a
@@ -75,6 +81,7 @@ class SourceConfig:
     latitude: str | None = None
     longitude: str | None = None
     altitude: str | None = None
+    unit: Unit | None = None
     where: str | None = None
     covariance: str | None = None
     sigma: str | None = None

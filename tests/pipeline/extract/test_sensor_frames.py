@@ -224,7 +224,7 @@ def test_truth_in_another_frame_is_brought_to_the_detections(tmp_path: Path) -> 
 
 def test_frames_that_nothing_joins_are_an_error(tmp_path: Path) -> None:
     other = detection(3.0, 1.0, 2.0, topic="/camera/detections", frame="cart")
-    match = r"different frames: /camera/detections \(cart\), /radar/contacts \(radar\); no transform of the log joins them"
+    match = r"detections are in the frame cart, which no transform of the log joins to another \(ship → radar; map → ship\)"
     fails(mk(tmp_path / "a"), [seen_row(2.0), other, *cruise(ros2_row)], InputError, match)
     match = "extract.frame: no position and no transform of the log is in 'world'; known: map, radar, ship"
     fails(mk(tmp_path / "b"), [seen_row(2.0), *cruise(ros2_row)], ConfigError, match, frame="world")
@@ -237,7 +237,7 @@ def test_cycles_and_bad_transforms_are_named(tmp_path: Path) -> None:
     broken.message["rotation"] = {"x": 0.0, "y": 0.0, "z": 0.0, "w": 0.0}  # type: ignore[index, call-overload]
     found = run(tmp_path, [seen_row(2.0), *odd, broken, *cruise(ros2_row)])
     assert found.summary["transforms"]["problems"] == ["frames a → b → a form a cycle and are not used"]
-    assert found.summary["transforms"]["bad_transforms"] == 1
+    assert found.summary["transforms"]["zero_rotations"] == 1
     assert places(found)[0] == pytest.approx(TARGET, abs=1e-6)
 
 

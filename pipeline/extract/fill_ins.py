@@ -1,0 +1,60 @@
+"""What stands where no position is known: receivers and trackers write zeros and the like, and call them valid."""
+
+from typing import Final
+
+import numpy as np
+
+from pipeline.arrays import Bools
+from pipeline.extract.plausibility import Suspicions
+from pipeline.extract.positions import Positions, numbered
+
+_FILL_INS: Final = np.array(
+    [(0, 0), (-1, -1), (90, 180), (-90, -180), (180, 180), (999, 999), (9999, 9999), (99999, 99999)], float
+)
+_DEGREE_M: Final = 111_000.0
+_MIN_APART_M: Final = 10.0
+_MIN_JUMP_MPS: Final = 10.0
+_JUMP_RATIO: Final = 10.0
+"""A robot that starts at 0, 0 goes on from there. What comes there ten times as fast as it ever moves was not there."""
+
+
+def without_fill_ins(rows: Positions, role: str, suspicions: Suspicions) -> Positions:
+    """The rows of one reader without those at 0, 0 and the like, which are told as a suspicion."""
+    if len(rows) == 0 or not suspicions.looks_for("place"):
+        return rows
+    is_fill_in, agent = np.zeros(len(rows), np.bool_), numbered(rows.agent)
+    places = np.column_stack([rows.first, rows.second])
+    for value in _FILL_INS:
+        is_value = (places == value).all(axis=1)
+        for number in np.unique(agent[is_value]):
+            of_agent = agent == number
+            if _jumps(rows[of_agent], is_value[of_agent]):
+                is_fill_in |= is_value & of_agent
+    if not is_fill_in.any():
+        return rows
+    at = " and ".join(f"{first:g}, {second:g}" for first, second in np.unique(places[is_fill_in], axis=0))
+    suspicions.add(
+        "place", str(rows.topic[0]),
+        seen=f"{int(is_fill_in.sum())} of {len(rows)} positions are at {at}, where none of the others could come from or go to",
+        done="left out",
+        setting=f'where in its [[extract.{role}]] (a condition that tells them), or extract.trusted = ["place"]',
+    )  # fmt: skip
+    return rows[~is_fill_in]
+
+
+def _jumps(rows: Positions, is_value: Bools) -> bool:
+    """Whether the rows of an agent at one place are beyond reach of its others; of degrees, whether there are no others."""
+    unit_m = _DEGREE_M if rows.is_geodetic[0] else 1.0
+    if is_value.all():
+        return bool(rows.is_geodetic[0])
+    order = np.argsort(rows.time_ns, kind="stable")
+    step_m = unit_m * np.hypot(np.diff(rows.first[order]), np.diff(rows.second[order]))
+    duration_s = np.diff(rows.time_ns[order]) * 1e-9
+    is_pair = np.isfinite(step_m) & (duration_s > 0)
+    speed_mps = step_m[is_pair] / duration_s[is_pair]
+    is_jump, is_own = (np.diff(is_value[order])[is_pair], ~(is_value[order][1:] | is_value[order][:-1])[is_pair])
+    if not is_jump.any():
+        return False
+    own_mps = float(np.quantile(speed_mps[is_own], 0.95)) if is_own.any() else 0.0
+    is_far = float(step_m[is_pair][is_jump].min()) > _MIN_APART_M
+    return is_far and bool(np.median(speed_mps[is_jump]) > max(_JUMP_RATIO * own_mps, _MIN_JUMP_MPS))

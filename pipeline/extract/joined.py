@@ -1,0 +1,74 @@
+"""Frames of detections that nothing joins to the world: a sensor's coordinates are not taken for places."""
+
+import re
+from collections.abc import Callable
+from typing import Final
+
+from cadence.errors import InputError
+from pipeline.extract.plausibility import Suspicions
+from pipeline.extract.positions import Positions
+from pipeline.extract.transform_messages import LogTransforms
+from pipeline.extract.transforms import TransformTree
+from pipeline.logs.parts import missing_parts, recorded_parts
+from pipeline.logs.reader import MissionLog
+
+_FIXED_WORDS: Final = {
+    "map", "odom", "world", "mission", "enu", "ned", "local", "origin", "fixed", "global", "utm", "earth", "ecef", "wgs84",
+    "vicon", "mocap", "optitrack", "qualisys",
+}  # fmt: skip
+"""Words in the names of frames that stand still, by convention."""
+_BODIES: Final = {"base_link", "base_footprint", "base", "body", "chassis", "vehicle"}
+"""Frames that move with a vehicle, by REP 105 and custom."""
+_MAX_NAMED: Final = 6
+
+
+def check_joined(
+    rows: Positions, role: str, transforms: LogTransforms, read_tree: Callable[[], TransformTree], log: MissionLog,
+    suspicions: Suspicions,
+) -> None:  # fmt: skip
+    """Refuse rows in metres of a frame that no transform joins, in a log that has transforms, and of a camera's optical frame.
+
+    Raises `InputError` with the way out. A vehicle's frame in a log without transforms is told as a suspicion.
+    """
+    names = sorted({str(name) for name in set(rows.frame_id[~rows.is_geodetic]) if name and not _stands_still(str(name))})
+    if not names or not suspicions.looks_for("place"):
+        return
+    tree = read_tree()
+    worlds = {name: tree.world(name) for name in (*tree.links, *(link.parent for link in tree.links.values()))}
+    are_still = {world for world in worlds.values() if _stands_still(world)}
+    apart = [name for name in names if name not in worlds or (are_still and worlds[name] not in are_still)]
+    if apart and (tree.links or tree.problems or transforms.counts):
+        known = "; ".join(_links(tree)) or "none that can be used"
+        reason = f"{role} are in the frame {', '.join(apart)}, which no transform of the log joins to another ({known}"
+        lost = "".join(f"; {count} {fault}" for fault, count in transforms.faults())
+        raise InputError(f"{reason}{lost}); {_way_out(apart[0], log)}")
+    optical = [name for name in apart if "optical" in name.lower()]
+    if optical:
+        raise InputError(
+            f"{role} are in the optical frame {optical[0]}, whose x and y are those of the image and whose z is the distance, "
+            f"and the log has no transforms; {_way_out(optical[0], log)}"
+        )
+    for body in sorted({name for name in (worlds.get(name, name) for name in names) if name.rpartition("/")[2] in _BODIES}):
+        suspicions.add(
+            "place", f"frame {body}", seen="by its name it moves with a vehicle, and no transform of the log says how",
+            done=f"{role} are taken as if it stood still", setting=f'extract.frame = "{body}"',
+        )  # fmt: skip
+
+
+def _stands_still(name: str) -> bool:
+    return not _FIXED_WORDS.isdisjoint(re.split(r"[^a-z0-9]+", name.lower()))
+
+
+def _links(tree: TransformTree) -> list[str]:
+    found = [f"{link.parent} → {link.child}" for link in tree.links.values()]
+    return [*found[:_MAX_NAMED], *([f"{len(found) - _MAX_NAMED} more"] if len(found) > _MAX_NAMED else []), *tree.problems]
+
+
+def _way_out(frame: str, log: MissionLog) -> str:
+    folder, absent = log.path.parent, missing_parts([log.path])
+    others = [part for part in recorded_parts(folder) if part not in log.parts]
+    stated = f'if it stands still, state extract.frame = "{frame}"'
+    if log.path in recorded_parts(folder) and (others or absent):
+        where = f"run the folder {folder}" if others else f"find {', '.join(map(str, absent))}"
+        return f"this is a part of a split recording, whose first part alone has the static transforms: {where}; or {stated}"
+    return f"record its transforms with it; or {stated}"

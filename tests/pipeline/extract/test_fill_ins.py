@@ -1,0 +1,69 @@
+"""Zeros and the like where no position is known, and real ones that only look like them."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fixtures.small_logs import Row, detection, fix
+from test_extract import fails, run
+
+from cadence.errors import InputError
+
+
+def by_time(rows: list[Row]) -> list[Row]:
+    return sorted(rows, key=lambda row: row.time_s)
+
+
+def drive(num: int, first: int = 0, topic: str = "/contacts/A") -> list[Row]:
+    return [fix(float(i), 48.1 + 1e-4 * i, 11.6, topic) for i in range(first, first + num)]
+
+
+@pytest.mark.parametrize("place", [(0.0, 0.0), (-1.0, -1.0), (90.0, 180.0)])
+@pytest.mark.parametrize("times", [range(20), range(25, 30), range(50, 90)])
+def test_a_receiver_without_a_fix_that_does_not_say_so(tmp_path: Path, place: tuple[float, float], times: range) -> None:
+    rows = [fix(float(i), *place) if i in times else drive(1, i)[0] for i in range(90)]
+    found = run(tmp_path, rows)
+    assert found.summary["num_detections"] == 90 - len(times)
+    assert float(np.abs(np.asarray(found.detections["y_m"])).max()) < 1000.0
+    (suspicion,) = found.summary["suspicions"]
+    assert f"{len(times)} of 90 positions are at {place[0]:g}, {place[1]:g}" in suspicion["seen"]
+
+
+def test_nothing_but_zeros(tmp_path: Path) -> None:
+    rows = [fix(float(i), 0.0, 0.0) for i in range(10)]
+    fails(tmp_path, rows, InputError, "10 of 10 positions are at 0, 0")
+
+
+def test_a_tracker_that_waits_at_zero(tmp_path: Path) -> None:
+    rows = [detection(float(i), 0.0, 0.0, agent_id="a") for i in range(5)]
+    rows += [detection(float(i), 400.0 + 3.0 * i, 300.0, agent_id="a") for i in range(5, 40)]
+    rows += [detection(float(i), 7.0 * i, 0.0, agent_id="b") for i in range(40)]
+    found = run(tmp_path, by_time(rows))
+    assert found.summary["num_detections"] == 75 and len(found.summary["suspicions"]) == 1
+
+
+@pytest.mark.parametrize(
+    "rows",
+    [
+        [detection(float(i), max(0.0, 3.0 * (i - 5)), 0.0, agent_id="a") for i in range(40)],  # starts at its origin
+        [detection(float(i), 0.0, 0.0, agent_id="a") for i in range(40)],  # stands there
+        [detection(float(i), 5.0 * (i - 20), 0.0, agent_id="a") for i in range(40)],  # passes
+        # seen where it started, and later where it came to
+        [detection(float(i), 0.0, 0.0, agent_id="a") for i in range(5)]
+        + [detection(60.0 + i, 180.0 + 3.0 * i, 0.0, agent_id="a") for i in range(30)],
+        [fix(float(i), 1e-5 * i, 0.0) for i in range(40)],  # a simulator about 0, 0
+        [detection(float(i), 0.0, 0.0, agent_id="beacon") for i in range(40)]
+        + [detection(float(i), 300.0 + 3.0 * i, 0.0, agent_id="a") for i in range(40)],
+    ],
+)
+def test_real_zeros(tmp_path: Path, rows: list[Row]) -> None:
+    found = run(tmp_path, by_time(rows))
+    assert found.summary["num_detections"] == len(rows) and found.summary["suspicions"] == []
+
+
+def test_the_way_otherwise(tmp_path: Path) -> None:
+    rows = [*(fix(float(i), 0.0, 0.0) for i in range(5)), *drive(20, 5)]
+    trusted = run(tmp_path, rows, trusted=["place"], max_speed_mps=1e9)
+    assert trusted.summary["num_detections"] == 25
+    told = run(tmp_path, rows, detections=[{"topic": "/contacts/{agent}", "where": "latitude != 0"}])
+    assert (told.summary["num_detections"], told.summary["unmet"], told.summary["suspicions"]) == (20, 5, [])

@@ -1,0 +1,91 @@
+"""Frames that nothing joins to the world: refused where the log knows better, told where only a name speaks."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fixtures.ros_messages import Builder, store_with
+from fixtures.small_logs import Row, detection, time_ns, write_log
+from test_extract import QUIET, fails, mk, run
+
+from cadence.errors import InputError
+from pipeline.extract.stage import ExtractConfig, write_tables
+from pipeline.logs.reader import open_log
+
+ROS = Builder(store_with())
+
+
+def transform(time_s: float, parent: str, child: str, x: float = 0.0, topic: str = "/tf", is_unset: bool = False) -> Row:
+    rotation = ROS.turn(w=0.0) if is_unset else ROS.turn()
+    motion = ROS("geometry_msgs/msg/Transform", translation=ROS("geometry_msgs/msg/Vector3", x=x), rotation=rotation)
+    header = ROS.header(parent, time_ns(time_s))
+    link = ROS("geometry_msgs/msg/TransformStamped", header=header, child_frame_id=child, transform=motion)
+    return ROS.cdr_row(ROS("tf2_msgs/msg/TFMessage", transforms=[link]), topic, time_s)
+
+
+def seen(frame: str, num: int = 20) -> list[Row]:
+    """A target at (100, 30) of the world from a vehicle that drives east at 1 m/s."""
+    return [detection(float(i), 100.0 - i, 30.0, topic="/radar/contacts", frame=frame) for i in range(num)]
+
+
+DRIVE = [transform(float(i), "odom", "base_link", float(i)) for i in range(20)]
+MOUNT = transform(0.0, "base_link", "radar", topic="/tf_static")
+
+
+def test_joined_frames_come_to_the_world(tmp_path: Path) -> None:
+    found = run(tmp_path, [MOUNT, *DRIVE, *seen("radar")])
+    np.testing.assert_allclose(found.detections["x_m"], 100.0)
+    assert found.summary["suspicions"] == []
+
+
+def test_a_frame_that_no_transform_joins(tmp_path: Path) -> None:
+    match = r"detections are in the frame radar, which no transform .* \(odom → base_link\); record its transforms"
+    fails(mk(tmp_path / "a"), [*DRIVE, *seen("radar")], InputError, match)
+    stated = run(mk(tmp_path / "b"), [*DRIVE, *seen("radar")], frame="radar")
+    assert stated.frame.frame_id == "radar" and stated.detections["x_m"][0].as_py() == 100.0
+    assert run(mk(tmp_path / "c"), [*DRIVE, *seen("radar")], trusted=["place"]).frame.frame_id == "radar"
+
+
+def test_a_tree_of_its_own(tmp_path: Path) -> None:
+    """The radar's antenna has a mount, but nothing says where the mount is."""
+    mount = transform(0.0, "radar", "antenna", topic="/tf_static")
+    fails(tmp_path, [mount, *DRIVE, *seen("antenna")], InputError, "frame antenna, which no transform")
+
+
+def test_a_rotation_of_zeros(tmp_path: Path) -> None:
+    unset = [transform(float(i), "map", "base_link", float(i), is_unset=True) for i in range(20)]
+    fails(tmp_path, [*unset, *seen("base_link")], InputError, "20 transforms have a rotation of zeros, which is none")
+
+
+@pytest.mark.parametrize("extra", [[], DRIVE])
+def test_an_image_is_no_map(tmp_path: Path, extra: list[Row]) -> None:
+    fails(tmp_path, [*extra, *seen("camera_color_optical_frame")], InputError, "optical_frame")
+
+
+def test_a_vehicle_without_transforms_moves_by_its_name(tmp_path: Path) -> None:
+    found = run(mk(tmp_path / "a"), seen("robot1/base_link"))
+    (suspicion,) = found.summary["suspicions"]
+    assert (suspicion["kind"], suspicion["subject"]) == ("place", "frame robot1/base_link")
+    assert suspicion["setting"] == 'extract.frame = "robot1/base_link"'
+    assert run(mk(tmp_path / "b"), seen("robot1/base_link"), frame="robot1/base_link").summary["suspicions"] == []
+    mounted = run(mk(tmp_path / "c"), [MOUNT, *seen("radar")])  # its root is the vehicle, which nothing moves
+    assert mounted.summary["suspicions"][0]["subject"] == "frame base_link"
+
+
+@pytest.mark.parametrize("frame", ["map", "robot1/odom", "world_ned", "local_origin", "radar", "qualisys", ""])
+@pytest.mark.parametrize("extra", [[], DRIVE])
+def test_frames_that_stand(tmp_path: Path, frame: str, extra: list[Row]) -> None:
+    if frame == "radar" and extra:
+        pytest.skip("refused above")
+    assert run(tmp_path, [*extra, *seen(frame)]).summary["suspicions"] == []
+
+
+def test_a_part_of_a_split_recording_has_no_static_transforms(tmp_path: Path) -> None:
+    later = [row for i, row in enumerate(DRIVE)] + seen("radar")
+    first, second = write_log(tmp_path / "run_0.mcap", [MOUNT, *DRIVE]), write_log(tmp_path / "run_1.mcap", later)
+    (tmp_path / "metadata.yaml").write_text(f"  relative_file_paths:\n    - {first.name}\n    - {second.name}\n")
+    with pytest.raises(InputError, match=rf"part of a split recording, .* run the folder {tmp_path}; or"):
+        write_tables(open_log(second), tmp_path, ExtractConfig(), QUIET)
+    first.unlink()
+    with pytest.raises(InputError, match=r"find .*run_0\.mcap; or"):
+        write_tables(open_log(second), tmp_path, ExtractConfig(), QUIET)
