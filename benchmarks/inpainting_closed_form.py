@@ -17,7 +17,7 @@ from benchmarks import publishing
 from benchmarks.publishing import Measurement
 from cadence.diffusion.inpainting import grid_detections, known_cells, overwritten, overwritten_at_level, smoother_correction
 from cadence.diffusion.sampler import sample_ddpm, sample_dpmpp_2m
-from cadence.diffusion.schedule import cosine_schedule
+from cadence.schedule import cosine_schedule
 
 T, STEP, MEMORY, RATE = 64, 0.02, 8.0, 0.12
 MODES = ("none", "overwrite", "noise_matched", "smoother")

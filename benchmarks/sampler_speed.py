@@ -31,11 +31,11 @@ from cadence.constraints.obstacles import Obstacles
 from cadence.diffusion.feasible import Feasibility
 from cadence.diffusion.general import GeneralModel
 from cadence.diffusion.guidance import PaperCost, adam_guidance
-from cadence.diffusion.residual import ResidualContext, build_context
 from cadence.diffusion.sampler import sample_ddpm
-from cadence.diffusion.schedule import clean_from, cosine_schedule
 from cadence.metrics import bootstrap_ratio, energy_score, masked_mean
 from cadence.network.residual import ResidualNetwork
+from cadence.network.residual_context import ResidualContext, build_context
+from cadence.schedule import clean_from, cosine_schedule
 from cadence.types import HypothesisSet
 from cadence.worlds.episode import Episode
 from cadence.worlds.patrol import PatrolConfig, simulate_patrol

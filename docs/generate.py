@@ -31,7 +31,7 @@ Made from the commands' own help by `make docs`.
 
 Results go to stdout (as text, or with `--json` as JSON), progress and errors to stderr. Exit codes: 0 ok, 1 defect (with a
 traceback), 2 wrong call, 3 unusable input, 4 configuration, mapping or checkpoint that does not fit, 5 device or storage,
-6 quality gate not met, 7 damaged input (`cadence doctor`), 8 suspected input (something in a log can hardly be meant as it
+7 damaged input (`cadence doctor`), 8 suspected input (something in a log can hardly be meant as it
 stands: formats.md), 130 interrupted (Ctrl-C, SIGTERM). `cadence run` on several logs goes on after a bad one and leaves with
 the highest code of the failures; without a failure with 8 where results rest on a suspicion, with 7 where a log is damaged,
 and with 3 where nothing was detected in any log. Suspicion counts more than damage: a gap is seen as a gap, while a wrong

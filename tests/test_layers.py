@@ -23,6 +23,16 @@ SOURCES = sorted(
 )
 # Inside a layer, from the ground up: what stands on a floor may import what stands below it, and nothing beside it.
 FLOORS = {
+    "cadence": (
+        {"arrays", "errors", "schedule"},
+        {"constraints", "metrics", "resampling"},
+        {"association", "types"},
+        {"bank", "recordings"},
+        {"network", "worlds"},
+        {"diffusion"},
+        {"baselines"},
+        {"training"},
+    ),
     "pipeline": (
         {"documents", "out_of_memory", "suggestions"},
         {"arrays", "config", "locks", "progress", "provenance", "plain_rows", "obstacle_file"},

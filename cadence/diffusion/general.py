@@ -15,11 +15,11 @@ from torch import Tensor
 from cadence.bank.bank import Bank, BankPosterior
 from cadence.bank.rows import active_rows, scatter_hypotheses, with_status
 from cadence.diffusion.feasible import Feasibility, GuidanceConfig, resampled
-from cadence.diffusion.residual import ResidualContext, build_context
 from cadence.diffusion.sampler import even_angles, sample_ddim, sample_dpmpp_2m, sample_rotation
-from cadence.diffusion.schedule import clean_from
 from cadence.diffusion.transport import bend_of, smoothed_displacement
 from cadence.network.residual import ResidualNetwork
+from cadence.network.residual_context import ResidualContext, build_context
+from cadence.schedule import clean_from
 from cadence.types import Detections, HypothesisSet, WindowBatch
 
 _SAMPLERS = {"rotation": sample_rotation, "ddim": sample_ddim, "dpmpp": sample_dpmpp_2m}

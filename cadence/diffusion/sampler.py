@@ -12,7 +12,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from cadence.diffusion.schedule import MAX_ANGLE, Schedule, noise_from
+from cadence.schedule import MAX_ANGLE, Schedule, noise_from
 
 Denoiser = Callable[[Tensor, float], Tensor]
 """(noisy [...], angle) -> clean estimate [...]."""

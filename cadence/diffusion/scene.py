@@ -20,12 +20,12 @@ from cadence.diffusion.noise import RowNoise
 from cadence.diffusion.sampler import even_angles, even_log_snr, sample_ddim, sample_ddpm, sample_dpmpp_2m
 from cadence.diffusion.scene_frame import SceneConfig, future_of, scene_inputs, to_pieces, to_track
 from cadence.diffusion.scene_team import agent_rows, shared_detections
-from cadence.diffusion.schedule import MAX_ANGLE, clean_from, cosine_schedule
 from cadence.errors import ConfigError
 from cadence.network.attention import MAX_AGENTS, Team
 from cadence.network.frozen import FrozenScene
 from cadence.network.scene import Pieces, SceneNetwork
 from cadence.recordings import NUM_STEPS
+from cadence.schedule import MAX_ANGLE, clean_from, cosine_schedule
 from cadence.types import Context, Detections, HypothesisSet, WindowBatch
 
 _START, _END = MAX_ANGLE - 0.04, 0.08

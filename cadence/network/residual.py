@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from cadence.diffusion.residual import NUM_DETECTION_FEATURES, NUM_FEATURES, ResidualContext, encoder_rows, features
 from cadence.network.encoder import DetectionEncoder
+from cadence.network.residual_context import NUM_DETECTION_FEATURES, NUM_FEATURES, ResidualContext, encoder_rows, features
 from cadence.network.unet import NoiseLevelEmbedding, UNet, UNetConfig
 
 _LEVEL_SCALE = 100.0

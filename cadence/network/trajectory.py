@@ -10,9 +10,9 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-from cadence.diffusion.schedule import MAX_ANGLE, Prediction, Schedule, clean_from, cosine_schedule
 from cadence.network.encoder import DetectionEncoder
 from cadence.network.unet import NoiseLevelEmbedding, UNet, UNetConfig
+from cadence.schedule import MAX_ANGLE, Prediction, Schedule, clean_from, cosine_schedule
 
 NUM_DETECTION_FEATURES = 3
 """Columns of a detection's row: age, x, y."""

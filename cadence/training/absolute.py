@@ -7,9 +7,9 @@ from torch import Tensor
 
 from cadence.bank.rows import active_rows
 from cadence.diffusion.absolute import AbsoluteConfig, absolute_frame
-from cadence.diffusion.schedule import Schedule, target_of
 from cadence.network.trajectory import TrajectoryNetwork
 from cadence.recordings import ForecastWindows
+from cadence.schedule import Schedule, target_of
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,9 +5,9 @@ import math
 import torch
 from torch import Tensor, nn
 
-from cadence.diffusion.residual import RESIDUAL_CLAMP, ResidualContext, rotate
-from cadence.diffusion.schedule import MAX_ANGLE, target_of
 from cadence.network.residual import ResidualNetwork
+from cadence.network.residual_context import RESIDUAL_CLAMP, ResidualContext, rotate
+from cadence.schedule import MAX_ANGLE, target_of
 from cadence.training.synthetic import ResidualWindows
 
 

@@ -11,10 +11,10 @@ from cadence.arrays import Int64s
 from cadence.diffusion.sampler import even_angles, sample_ddim
 from cadence.diffusion.scene_frame import SceneConfig, recorded_track, scene_inputs, to_pieces
 from cadence.diffusion.scene_team import agent_rows, shared_detections
-from cadence.diffusion.schedule import MAX_ANGLE, clean_from
 from cadence.network.attention import Team
 from cadence.network.scene import Pieces, SceneInputs, SceneNetwork
 from cadence.recordings import NUM_STEPS, Recordings, cut_windows
+from cadence.schedule import MAX_ANGLE, clean_from
 
 _LEAST_ANGLE = 0.01
 _LOCAL_SCALE = 0.05

@@ -14,7 +14,7 @@ from torch import Tensor
 from cadence.bank.bank import Bank
 from cadence.bank.hindsight import candidates
 from cadence.bank.rows import active_rows
-from cadence.diffusion.residual import MAX_DETECTIONS, ResidualContext, build_context
+from cadence.network.residual_context import MAX_DETECTIONS, ResidualContext, build_context
 from cadence.types import Detections, WindowBatch
 from cadence.worlds.kinematics import SUBSTEPS, SyntheticTracks, draw_scenario, simulate_tracks
 

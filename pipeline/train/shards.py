@@ -11,7 +11,7 @@ import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file
 
-from cadence.diffusion.residual import ResidualContext
+from cadence.network.residual_context import ResidualContext
 from cadence.training.synthetic import ResidualWindows, SyntheticConfig, synthesise
 from pipeline.checkpoints import write_tensors
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from cadence.diffusion.sampler import even_angles, sample_ddim, sample_ddpm, sample_dpmpp_2m, sample_rotation
-from cadence.diffusion.schedule import MAX_ANGLE, clean_from, cosine_schedule
+from cadence.schedule import MAX_ANGLE, clean_from, cosine_schedule
 
 MEAN, SIGMA = 1.5, 0.4
 DETERMINISTIC = {"ddim": sample_ddim, "dpmpp": sample_dpmpp_2m, "rotation": sample_rotation}

@@ -8,7 +8,7 @@ from fixtures.bank import Moved, as_tracks, random_windows, turn_matrix
 from cadence.bank.bank import Bank, BankPosterior
 from cadence.bank.rows import active_rows
 from cadence.bank.smoother import Nodes
-from cadence.diffusion.residual import (
+from cadence.network.residual_context import (
     MAX_DETECTIONS,
     NUM_DETECTION_FEATURES,
     NUM_FEATURES,

@@ -5,8 +5,8 @@ import dataclasses
 import pytest
 import torch
 
-from cadence.diffusion.residual import NUM_FEATURES, ResidualContext
 from cadence.network.residual import ResidualNetwork, ResidualNetworkConfig
+from cadence.network.residual_context import NUM_FEATURES, ResidualContext
 from cadence.network.unet import NoiseLevelEmbedding, UNet, UNetConfig
 
 SMALL = UNetConfig(width=8, multipliers=(1, 2, 4), num_groups=4, condition_size=6)

@@ -8,7 +8,7 @@ import torch
 from fixtures.bank import as_tracks, random_windows
 
 from cadence.bank.bank import Bank
-from cadence.diffusion.residual import MAX_DETECTIONS, ResidualContext
+from cadence.network.residual_context import MAX_DETECTIONS, ResidualContext
 from cadence.training.synthetic import (
     ResidualWindows,
     SyntheticConfig,

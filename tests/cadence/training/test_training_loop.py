@@ -7,8 +7,8 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from cadence.diffusion.residual import RESIDUAL_CLAMP
 from cadence.network.residual import ResidualNetwork, ResidualNetworkConfig
+from cadence.network.residual_context import RESIDUAL_CLAMP
 from cadence.training.ema import Ema
 from cadence.training.loop import Loss, OptimiserConfig, Trainer
 from cadence.training.residual import residual_loss

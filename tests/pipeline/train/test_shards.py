@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from cadence.diffusion.residual import ResidualContext
+from cadence.network.residual_context import ResidualContext
 from cadence.training.synthetic import ResidualWindows, SyntheticConfig, synthesise
 from pipeline.train import shards
 

@@ -7,7 +7,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cadence.diffusion.schedule import MAX_ANGLE, Prediction, clean_from, cosine_schedule, noise_from, target_of
+from cadence.schedule import MAX_ANGLE, Prediction, clean_from, cosine_schedule, noise_from, target_of
 
 PREDICTIONS: tuple[Prediction, ...] = ("epsilon", "x0", "v")
 
