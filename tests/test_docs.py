@@ -50,6 +50,10 @@ def test_pages_that_people_look_for_are_there():
     assert wanted <= names
 
 
+def test_the_readme_is_read_in_minutes():
+    assert len((ROOT / "README.md").read_text(encoding="utf-8").split()) <= 900
+
+
 @pytest.mark.parametrize(("name", "make"), [("cli.md", generate.cli_page), ("configuration.md", generate.configuration_page)])
 def test_generated_pages_are_up_to_date(name, make):
     assert (ROOT / "docs" / name).read_text(encoding="utf-8") == make(), "call: make docs"
