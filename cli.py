@@ -158,8 +158,9 @@ def run(
     resolved = stage_config(RunConfig, None, config, chosen, seed)
     unwritten: list[CadenceError] = []
     outcomes = run_all(logs, out, resolved, Progress(quiet), force, engine, workers, report, unwritten.append)
-    typer.echo(to_json([log_record(outcome) for outcome in outcomes]) if as_json else batch_summary(outcomes))
-    for complaint in (*complaints(outcomes), *map(str, unwritten)):
+    failures = complaints(outcomes)
+    typer.echo(to_json([log_record(outcome) for outcome in outcomes]) if as_json else batch_summary(outcomes, failures))
+    for complaint in (*failures, *map(str, unwritten)):
         _complain(complaint)
     return exit_code(outcomes, unwritten)
 

@@ -232,9 +232,9 @@ def test_damage_has_its_code_in_every_command_that_reads_the_log(tmp_path, capsy
 def test_secrets_of_urls_are_never_told(arguments, scheme, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     log = write_log(tmp_path / "a.mcap", straight_line(6))
-    url = f"{scheme}://who:p-hidden@host/a.mcap?token=q-hidden"
+    url = f"{scheme}://someuser:p-hidden@host/a.mcap?token=q-hidden"
     words = [word.format(url=url, out=tmp_path / "out", log=log) for word in arguments]
     assert cli.main(words) != 0
     told = "".join(capsys.readouterr())
-    assert "hidden" not in told and "who" not in told and "cadence: error:" in told
+    assert "hidden" not in told and "someuser" not in told and "cadence: error:" in told
     assert all("hidden" not in path.read_text() for path in tmp_path.rglob("*.json"))

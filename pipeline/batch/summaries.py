@@ -3,7 +3,7 @@
 import dataclasses
 import json
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any, get_args
 
 from cadence.errors import ImplausibleInputError, PartialInputError
@@ -17,6 +17,15 @@ SHOWN_STAGES = ("export", "report")
 
 MAX_LOGS_WITH_FILES = 3
 """With more logs than this the files of each are not listed."""
+
+_OPENED_WITH = {
+    ".cadence.mcap": "for Foxglove or Lichtblick, together with {log}",
+    ".combined.mcap": "for either, by itself",
+    ".layout.json": "its layout for Foxglove",
+    ".layout.legacy.json": "its layout for Lichtblick",
+    "report.html": "open this in a browser",
+}
+"""What files are for, by the ends of their names, in the order in which they are listed."""
 
 BATCH_VERSION = 1
 """Version of batch.json."""
@@ -79,8 +88,11 @@ def batch_record(outcomes: Sequence[LogOutcome], exit_code: int, elapsed_s: floa
     }
 
 
-def batch_summary(outcomes: Sequence[LogOutcome]) -> str:
-    """A table with a row a log, what was lost and what is suspected, and the files to look at where they are few."""
+def batch_summary(outcomes: Sequence[LogOutcome], told: Collection[str] = ()) -> str:
+    """A table with a row a log, what was lost, suspected and assumed, and what to open.
+
+    Messages that are `told` elsewhere are left out of the table: a failure is read once.
+    """
     numbers = ("num_windows", "num_agents", "num_detections")
     rows = [("log", "status", "windows", "agents", "detections", "time", "")]
     lines = []
@@ -90,13 +102,42 @@ def batch_summary(outcomes: Sequence[LogOutcome]) -> str:
         summary = {name: value for stage in stages for name, value in stage.summary.items()}
         windows, agents, detections = (str(summary.get(name, "-")) for name in numbers)
         elapsed = f"{outcome.elapsed_s:.1f} s"
-        rows.append((outcome.task.name, outcome.status, windows, agents, detections, elapsed, outcome.message))
+        message = "" if outcome.message in told else outcome.message
+        rows.append((outcome.task.name, outcome.status, windows, agents, detections, elapsed, message))
         for stage in outcome.stages:
             lines += [f"{outcome.task.name}: damaged: {problem}" for problem in stage.summary.get("problems", ())]
             lines += [f"{outcome.task.name}: suspected {line}" for line in few(suspicions_in(stage.summary))]
-            if stage.stage in SHOWN_STAGES and len(outcomes) <= MAX_LOGS_WITH_FILES:
-                lines += [f"  {path}" for path in stage.outputs]
-    return "\n".join([*_table(rows), *lines])
+        lines += [f"{outcome.task.name}: assumed: {line}" for line in _assumptions(summary)]
+    return "\n".join([*_table(rows), *lines, *_to_open(outcomes)])
+
+
+def _assumptions(summary: Mapping[str, Any]) -> list[str]:
+    """What was assumed of detections that do not say whose they are, and which lines say otherwise."""
+    num, unnamed, found = summary.get("num_unknown_origin", 0), summary.get("unnamed", {}), summary.get("association")
+    if not num or "num_windows" not in summary:
+        return []
+    of = f" of {', '.join(list(unnamed)[:4])}{' and others' if len(unnamed) > 4 else ''}" if unnamed else ""
+    told = "were taken for one target" if found is None else f"were told apart as those of {found['num_agents']} targets"
+    paths = {path for path in unnamed.values() if path is not None}
+    ways = [f'agent_path = "{path}" in [[extract.detections]] reads it from the messages' for path in sorted(paths)[:1]]
+    ways += ['agent = "NAME" there means one target', "infer.association.num_agents = N is how many there are"]
+    return [f"{num} detections{of} do not say whose they are and {told}; to have it otherwise: {', '.join(ways)}"]
+
+
+def _to_open(outcomes: Sequence[LogOutcome]) -> list[str]:
+    """What to look at, and with what, the page last; of many logs only how their pages are called."""
+    finished = [outcome for outcome in outcomes if any(stage.stage == "report" for stage in outcome.stages)]
+    if finished and len(outcomes) > MAX_LOGS_WITH_FILES:
+        folder = shown(finished[0].task.directory).rpartition("/")[0]
+        return [f"open {folder}/*/report.html in a browser, {len(finished)} pages"]
+    lines = []
+    for outcome in outcomes:
+        paths = [str(path) for stage in outcome.stages if stage.stage in SHOWN_STAGES for path in stage.outputs]
+        log = outcome.task.log if len(outcome.task.parts) == 1 else f"{outcome.task.log} and its other parts"
+        found = [(path, words) for ending, words in _OPENED_WITH.items() for path in paths if path.endswith(ending)]
+        width = max((len(path) for path, _ in found), default=0)
+        lines += [f"  {path.ljust(width)}  {words.format(log=log)}" for path, words in found]
+    return lines
 
 
 def _table(rows: Sequence[Sequence[str]]) -> list[str]:

@@ -10,6 +10,7 @@ from pipeline.extract.plausibility import Suspicions, few
 from pipeline.extract.positions import ChannelReader, Positions
 from pipeline.extract.selection import ROLES
 from pipeline.logs.reader import MissionLog
+from pipeline.mapping.presets import PRESETS, preset_for
 from pipeline.progress import Progress
 from pipeline.tables import Frame
 
@@ -71,6 +72,7 @@ def summarise(
         "num_unknown_origin": sum(agent is None for agent in detections.agent),
         "span_s": span_s,
         "frame": {"frame_id": frame.frame_id, "latitude_deg": frame.latitude_deg, "longitude_deg": frame.longitude_deg},
+        "unnamed": _unnamed(readers, detections),
         "sources": {role: sorted({r.source.topic for r in readers if r.role == role}) for role in ROLES},
         **{
             name: counts[name]
@@ -80,3 +82,15 @@ def summarise(
         "is_complete": log.health.is_complete,
         "suspicions": suspicions.records(),
     }
+
+
+def _unnamed(readers: Sequence[ChannelReader], detections: Positions) -> dict[str, str | None]:
+    """Topics with detections that do not say whose they are, and where messages of their type usually do; None: nowhere."""
+    topics = {str(topic) for topic, agent in zip(detections.topic, detections.agent, strict=True) if agent is None}
+    found = {}
+    for reader in readers:
+        if reader.role == "detections" and reader.channel.topic in topics:
+            preset = PRESETS.get(preset_for(reader.channel.schema_name) or "")
+            is_read = "agent" in reader.fields
+            found[reader.channel.topic] = preset.agent[0] if preset is not None and preset.agent and not is_read else None
+    return found

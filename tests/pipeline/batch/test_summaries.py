@@ -1,5 +1,6 @@
 """Results as people and programs read them."""
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -27,12 +28,41 @@ def test_logs_in_words_name_the_damage_and_only_the_files_to_open():
         "a     done          -       -           -  1.2 s",
         "long  failed        -       -           -  0.5 s  long.mcap: no",
         "a: damaged: cut off at 10:00",
-        "  o/a/a.cadence.mcap",
+        "  o/a/a.cadence.mcap  for Foxglove or Lichtblick, together with a.mcap",
     ]  # fmt: skip
 
 
-def test_files_of_many_logs_are_not_listed():
-    assert not [line for line in batch_summary([GOOD] * 4).splitlines() if "cadence.mcap" in line]
+def test_a_failure_that_is_told_elsewhere_is_not_told_again():
+    assert batch_summary([GOOD, BAD], ["long.mcap: no"]).splitlines()[2] == "long  failed        -       -           -  0.5 s"
+
+
+NAMES = ("report.html", "a.layout.legacy.json", "a.cadence.mcap", "a.layout.json")
+REPORT = StageResult("report", "done", tuple(Path("o/a") / name for name in NAMES), {})
+
+
+def test_what_to_open_is_said_with_what_it_is_for_and_the_page_comes_last():
+    outcome = dataclasses.replace(GOOD, stages=(REPORT,))
+    assert batch_summary([outcome]).splitlines()[2:] == [
+        "  o/a/a.cadence.mcap        for Foxglove or Lichtblick, together with a.mcap",
+        "  o/a/a.layout.json         its layout for Foxglove",
+        "  o/a/a.layout.legacy.json  its layout for Lichtblick",
+        "  o/a/report.html           open this in a browser",
+    ]
+    many = batch_summary([outcome] * 3 + [BAD]).splitlines()
+    assert many[-1] == "open o/*/report.html in a browser, 3 pages" and "cadence.mcap" not in "".join(many)
+
+
+def test_what_was_assumed_of_detections_without_identity_is_said_with_the_lines_that_say_otherwise():
+    extract = StageResult("extract", "done", (), {"num_unknown_origin": 7, "unnamed": {"/xy": "agent_id"}})
+    infer = StageResult("infer", "done", (), {"num_windows": 2, "association": {"num_agents": 6}})
+    text = batch_summary([dataclasses.replace(GOOD, stages=(extract, infer))])
+    assert "a: assumed: 7 detections of /xy do not say whose they are and were told apart as those of 6 targets" in text
+    assert 'agent_path = "agent_id"' in text and 'agent = "NAME"' in text and "infer.association.num_agents" in text
+    together = batch_summary(
+        [dataclasses.replace(GOOD, stages=(extract, StageResult("infer", "done", (), {"num_windows": 2})))]
+    )
+    assert "were taken for one target" in together
+    assert "assumed" not in batch_summary([dataclasses.replace(GOOD, stages=(extract,))])
 
 
 def test_logs_for_programs():

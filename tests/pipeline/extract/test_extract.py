@@ -426,3 +426,13 @@ def test_real_prison_log(tmp_path: Path) -> None:
         1,
         2166,
     ]
+
+
+def test_detections_that_do_not_say_whose_they_are_name_their_topics_and_where_identity_usually_stands(tmp_path: Path) -> None:
+    entry = {"topic": "/detections", "x": "position.x", "y": "position.y"}
+    assert run(mk(tmp_path / "a"), line(), detections=[entry]).summary["unnamed"] == {"/detections": "agent_id"}
+    assert run(mk(tmp_path / "b"), line(), detections=[entry | {"agent": "boat"}]).summary["unnamed"] == {}
+    assert run(mk(tmp_path / "c"), line(agent_id="T1")).summary["unnamed"] == {}
+    assert run(mk(tmp_path / "e"), line()).summary["unnamed"] == {"/detections": None}  # looked for there, and not found
+    rows = [dataclasses.replace(row, topic="/contacts") for row in DENSE]
+    assert run(mk(tmp_path / "d"), rows).summary["unnamed"] == {"/contacts": None}
