@@ -3,6 +3,7 @@
 import ast
 import functools
 import graphlib
+from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -184,3 +185,9 @@ def test_top_level_is_what_the_plan_says():
     folders = {path.name for path in ROOT.iterdir() if path.is_dir() and any(path.glob("*.py"))}
     assert folders <= {"cadence", "pipeline", "schemas", "tests", "benchmarks", "docs"}
     assert {path.name for path in ROOT.glob("*.py")} == {"cli.py"}
+
+
+def test_no_two_test_files_share_a_name():
+    """Pytest would refuse the second, but only where both are collected in one run."""
+    names = Counter(path.name for path in (ROOT / "tests").rglob("*.py"))
+    assert [name for name, count in names.items() if count > 1] == []
