@@ -4,37 +4,46 @@ Several sensors that see an agent at one moment say one thing about where it is.
 without time passing, and count as often as there are sensors.
 """
 
+import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline.arrays import Float64s, Int32s, Int64s
+from pipeline.arrays import Bools, Float64s, Int32s, Int64s
+from pipeline.extract.covariances import are_apart
 from pipeline.extract.positions import Positions
 
 
 @dataclass(frozen=True, eq=False)
 class Collapsed:
-    """`positions` sorted by time, and how many detections became each of them [N]."""
+    """`positions` sorted by time, how many detections became each of them [N], and how many were left out as they disagree."""
 
     positions: Positions
     num_merged: Int32s
+    num_disagreeing: int = 0
 
 
 def collapse(positions: Positions, tolerance_s: float) -> Collapsed:
     """Merge what each known agent's detections, sorted by time, say within `tolerance_s` of the first of a group.
 
     Equal positions are copies of one: the first with a covariance stays. Different ones become their mean weighted by inverse
-    covariance; those without covariance are exact, so where there are any the others say nothing more. Time, score and
-    provenance are those of the group's first; sensors are joined by `+`. Detections of unknown origin stay as they are.
+    covariance, those apart that do not agree with the most accurate one within their covariances: they are left out. Those
+    without covariance are exact, so where there are any the others say nothing more. Time, score and provenance are those of
+    the first that is merged; sensors are joined by `+`. Of detections of unknown origin only copies are merged: of equal
+    places at one and the same moment.
     """
     num_merged = np.ones(len(positions), dtype=np.int32)
     is_kept = np.ones(len(positions), dtype=np.bool_)
     first, second, z_m = positions.first.copy(), positions.second.copy(), positions.z_m.copy()
     covariance, sensor = positions.covariance_m2.copy(), positions.sensor.copy()
-    for group in _groups(positions, round(tolerance_s * 1e9)):
+    num_disagreeing = 0
+    for whole in itertools.chain(_groups(positions, round(tolerance_s * 1e9)), _copies(positions)):
+        group = whole[_agree(positions, whole)]
+        num_disagreeing += len(whole) - len(group)
         kept = group[0]
-        is_kept[group[1:]] = False
+        is_kept[whole] = False
+        is_kept[kept] = True
         num_merged[kept] = len(group)
         (first[kept], second[kept]), covariance[kept] = _merge(
             np.column_stack([positions.first[group], positions.second[group]]), positions.covariance_m2[group]
@@ -43,7 +52,7 @@ def collapse(positions: Positions, tolerance_s: float) -> Collapsed:
         z_m[kept] = heights[np.isfinite(heights)].mean() if np.isfinite(heights).any() else np.nan
         sensor[kept] = "+".join(sorted({name for name in positions.sensor[group] if name is not None})) or None
     merged = replace(positions, first=first, second=second, z_m=z_m, covariance_m2=covariance, sensor=sensor)
-    return Collapsed(merged[is_kept], num_merged[is_kept])
+    return Collapsed(merged[is_kept], num_merged[is_kept], num_disagreeing)
 
 
 def _groups(positions: Positions, tolerance_ns: int) -> Iterator[Int64s]:
@@ -61,6 +70,29 @@ def _groups(positions: Positions, tolerance_ns: int) -> Iterator[Int64s]:
             if end - place > 1:
                 yield rows[place:end]
             place = end
+
+
+def _copies(positions: Positions) -> Iterator[Int64s]:
+    """Row numbers of every group of detections of unknown origin that are one detection, told several times."""
+    rows = np.flatnonzero(positions.agent == None)  # noqa: E711 (elementwise)
+    columns = (positions.second[rows], positions.first[rows], positions.time_ns[rows])
+    rows = rows[np.lexsort(columns)]
+    is_same = np.ones(max(len(rows) - 1, 0), np.bool_)
+    for column in (positions.time_ns, positions.first, positions.second):
+        is_same &= np.diff(column[rows]) == 0
+    for group in np.split(rows, np.flatnonzero(~is_same) + 1):
+        if len(group) > 1:
+            yield np.sort(group)
+
+
+def _agree(positions: Positions, group: Int64s) -> Bools:
+    """Which rows of a group [n] agree with the most accurate of them; all where some state no accuracy."""
+    covariance = positions.covariance_m2[group]
+    if np.isnan(covariance[:, 0]).any():
+        return np.ones(len(group), np.bool_)
+    best = int(np.argmin(covariance[:, 0] + covariance[:, 2]))
+    place = np.column_stack([positions.first[group], positions.second[group]])
+    return ~are_apart(place - place[best], covariance, np.broadcast_to(covariance[best], covariance.shape))
 
 
 def _merge(position_m: Float64s, covariance_m2: Float64s) -> tuple[Float64s, Float64s]:

@@ -5,7 +5,7 @@ they do not fit says what was seen, what was done instead, and by which setting 
 given, silences the suspicion.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Final, Literal
 
@@ -14,6 +14,7 @@ Kind = Literal["identity", "time", "place", "covariance", "duplication", "stage"
 thing counted twice; stage: what a channel holds (detections, or a step of work on them)."""
 
 _MAX_SHOWN: Final = 10
+_MAX_LISTED: Final = 3
 
 
 @dataclass(frozen=True)
@@ -67,6 +68,12 @@ def few(sentences: Sequence[str]) -> list[str]:
     """The sentences for people: where a fault is in each of many channels, the first ones and how many more there are."""
     rest = [f"{len(sentences) - _MAX_SHOWN} more are in extract.manifest.json"] if len(sentences) > _MAX_SHOWN else []
     return [*sentences[:_MAX_SHOWN], *rest]
+
+
+def listed(names: Collection[str]) -> str:
+    """Names in quotation marks, the first ones of many."""
+    shown = ", ".join(f'"{name}"' for name in list(names)[:_MAX_LISTED])
+    return shown + (f" and {len(names) - _MAX_LISTED} more" if len(names) > _MAX_LISTED else "")
 
 
 def suspicions_in(summary: Mapping[str, Any]) -> list[str]:

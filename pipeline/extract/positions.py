@@ -284,7 +284,7 @@ class ChannelReader:
         if kind == "agent" and self.role == "detections" and self.source.has_identity is False:
             return None
         constant = self.names[kind]
-        name = _name(value) if constant is None else constant
+        name = _name(value if constant is None else constant)
         if name is not None or kind != {"truth": "agent", "poses": "sensor"}.get(self.role):
             return name
         topic = self.channel.topic.strip("/") or self.role
@@ -320,15 +320,19 @@ def _number(value: Any) -> float:
         return math.nan
 
 
+_NO_NAMES = {"", "-1", "none", "null", "nil", "nan", "n/a", "unknown", "unidentified", "undefined"}
+"""How messages and topics say that there is no identity."""
+
+
 def _name(value: Any) -> str | None:
     """An identity as text; None for none. UUIDs as bytes or numbers become hexadecimal."""
-    if value is None or value == "":
+    if value is None or (isinstance(value, str | int) and str(value).strip().lower() in _NO_NAMES):
         return None
     if isinstance(value, str | int):
         return str(value)
     if isinstance(value, float) and value.is_integer():
         return str(int(value))
-    inner = getattr(value, "uuid", value)
+    inner = value.get("uuid", value) if isinstance(value, dict) else getattr(value, "uuid", value)
     try:
         return bytes(inner).hex()
     except (TypeError, ValueError):

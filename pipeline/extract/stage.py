@@ -20,16 +20,18 @@ from pipeline.arrays import Objects
 from pipeline.catalogue import open_catalogued_log, read_catalogue
 from pipeline.extract.collapse import Collapsed, collapse
 from pipeline.extract.fill_ins import without_fill_ins
-from pipeline.extract.identity import without_false_names
 from pipeline.extract.joined import check_joined
 from pipeline.extract.mission_clock import on_one_clock
+from pipeline.extract.names import Naming, without_false_names
 from pipeline.extract.obstacle_sources import ObstacleSources, collect_obstacles
 from pipeline.extract.placement import Placing, bring_together, in_enu, mission_frame, place
 from pipeline.extract.plausibility import Kind, Suspicions, few
 from pipeline.extract.positions import ChannelReader, Positions, Rows
 from pipeline.extract.reading import read_positions
+from pipeline.extract.reuse import without_reused_names
 from pipeline.extract.selection import ROLES, select_readers, selected_channels, unused_channels
 from pipeline.extract.spikes import is_spike
+from pipeline.extract.stages import without_other_stages
 from pipeline.extract.stamps import moment_ns
 from pipeline.extract.stretches import without_set_back, without_unjoined
 from pipeline.extract.summary import summarise, tell
@@ -45,6 +47,8 @@ from pipeline.obstacle_file import OBSTACLES_NAME, write_obstacles
 from pipeline.progress import Progress
 from pipeline.tables import Frame, write_table
 from schemas.tables import DETECTIONS, POSES, TRUTH
+
+_MAX_DISAGREEING = 0.05
 
 
 @dataclass(frozen=True)
@@ -136,7 +140,9 @@ def write_tables(log: MissionLog, folder: Path, config: ExtractConfig, progress:
         rows, frame = _rows_in_frame(log, readers, config, counts, suspicions, transforms)
     counts["unselected_topics"] = len({c.topic for c in log.channels} - {c.topic for c in channels})
     detections = collapse(_with_default_sigma(rows["detections"], config.default_sigma_m), config.simultaneity_s)
-    counts["collapsed"] = len(rows["detections"]) - len(detections.positions)
+    counts["disagreeing"] = detections.num_disagreeing
+    _suspect_disagreement(detections, suspicions)
+    counts["collapsed"] = len(rows["detections"]) - len(detections.positions) - detections.num_disagreeing
     truth, counts["duplicate_truth"] = _without_repeats(rows["truth"])
     log_id = log.name
     write_table(_detection_table(log_id, detections), folder / "detections.parquet", "detections", frame)
@@ -202,14 +208,37 @@ def _rows_in_frame(
     rows = {role: in_enu(positions) for role, positions in rows.items()}
     frame = mission_frame(rows[primary], [rows[role] for role in ROLES if role != primary], config.datum)
     rows = {role: _placed(role, rows[role], frame, counts, transforms.apart) for role in ROLES}
-    believed = {reader.channel.topic for reader in readers if reader.source.has_identity}
-    rows["detections"] = without_false_names(rows["detections"], config.simultaneity_s, believed, suspicions)
+    rows["detections"] = _identified(rows["detections"], readers, config.simultaneity_s, suspicions)
     rows = {role: _without_spikes(rows[role], config.max_speed_mps, counts) for role in ROLES}
     if config.thinning.enabled:
         rows["detections"] = _thinned(rows[primary], config.thinning)
         if len(rows["detections"]) == 0:
             raise InputError("thinning left no detection; choose a smaller extract.thinning.mean_gap_s or another seed")
     return rows, frame
+
+
+def _identified(rows: Positions, readers: Sequence[ChannelReader], tolerance_s: float, suspicions: Suspicions) -> Positions:
+    """Detections, each counted once, with names that can be meant."""
+    of_detections = [reader for reader in readers if reader.role == "detections"]
+    naming = Naming(
+        believed={reader.channel.topic for reader in of_detections if reader.source.has_identity},
+        topical={reader.channel.topic for reader in of_detections if reader.names["agent"] is not None},
+    )
+    suggested = {reader.channel.topic: reader.channel.schema_name for reader in of_detections if not reader.is_stated}
+    rows = without_false_names(rows, tolerance_s, naming, suspicions)
+    rows = without_other_stages(rows, suggested, suspicions)
+    return without_reused_names(rows, tolerance_s, naming, suspicions)
+
+
+def _suspect_disagreement(detections: Collapsed, suspicions: Suspicions) -> None:
+    """Say where sensors contradict each other more than now and then."""
+    if detections.num_disagreeing > _MAX_DISAGREEING * len(detections.positions) and suspicions.looks_for("covariance"):
+        suspicions.add(
+            "covariance", "simultaneous detections",
+            seen=f"{detections.num_disagreeing} lie over four standard deviations from the most accurate one of the same agent",
+            done="they are left out",
+            setting="sigma_m, or has_identity = false, in a [[extract.detections]]",
+        )  # fmt: skip
 
 
 def _columns(parts: Sequence[Positions], counts: Counter[str]) -> Positions:

@@ -27,6 +27,7 @@ def tell(counts: Counter[str], suspicions: Suspicions, detections: Positions, lo
         "unmet": "positions do not meet the conditions of `where` and were skipped",
         "bad_covariance": "covariances are not positive definite and were replaced by the default",
         "out_of_order": "time stamps were out of order and were sorted",
+        "disagreeing": "simultaneous detections of an agent do not agree with the most accurate one, and were skipped",
         "spikes": "positions lie far off their track (see extract.max_speed_mps) and were skipped",
         "other_frame": "positions are in another frame than the detections, which no transform joins, and were skipped",
         "no_transform": "positions have no transform near enough in time (see extract.max_extrapolation_s) and were skipped",
@@ -44,6 +45,12 @@ def tell(counts: Counter[str], suspicions: Suspicions, detections: Positions, lo
         progress.note(f"extract: suspected {line}")
     for problem in log.health.problems:
         progress.note(f"extract: {problem}")
+
+
+def _sources(role: str, readers: Sequence[ChannelReader], detections: Positions) -> list[str]:
+    """The topics of a role; of detections those of which some are left."""
+    left = set(detections.topic)
+    return sorted({r.source.topic for r in readers if r.role == role and (role != "detections" or r.channel.topic in left)})
 
 
 def summarise(
@@ -73,10 +80,10 @@ def summarise(
         "span_s": span_s,
         "frame": {"frame_id": frame.frame_id, "latitude_deg": frame.latitude_deg, "longitude_deg": frame.longitude_deg},
         "unnamed": _unnamed(readers, detections),
-        "sources": {role: sorted({r.source.topic for r in readers if r.role == role}) for role in ROLES},
+        "sources": {role: _sources(role, readers, detections) for role in ROLES},
         **{
             name: counts[name]
-            for name in (*names, "other_frame", "spikes", "collapsed", "duplicate_truth", "unselected_topics")
+            for name in (*names, "other_frame", "spikes", "collapsed", "disagreeing", "duplicate_truth", "unselected_topics")
         },
         "lost_spans_ns": [list(span) for span in log.health.lost_spans_ns],
         "is_complete": log.health.is_complete,

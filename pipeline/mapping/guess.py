@@ -13,25 +13,16 @@ from typing import Final, Literal
 from pipeline.mapping.field_paths import coordinate_paths
 from pipeline.mapping.presets import PRESETS, SETPOINTS, normalise_schema, preset_for
 from pipeline.mapping.sources import ChannelLike, SourceConfig
+from pipeline.mapping.topic_names import DETECTION_WORDS, POSE_WORDS, TRUTH_WORDS, pattern_of, words_of
 
 Role = Literal["detections", "truth", "poses", "positions", "tf", "obstacles"]
 """`positions` are positions whose name does not tell of what; `tf` and `obstacles` have readers of their own."""
 
-_TRUTH = {"truth", "groundtruth", "gt", "mocap", "vicon", "optitrack", "qualisys"}
-_DETECTION = {
-    "contact", "contacts", "detection", "detections", "detected", "track", "tracks", "target", "targets", "sighting",
-    "sightings", "observation", "observations", "measurement", "measurements", "ais", "adsb", "radar", "report", "reports",
-}  # fmt: skip
-_POSE = {
-    "pose", "poses", "odom", "odometry", "fix", "gps", "gnss", "navsat", "location", "position", "tracker", "trackers",
-    "sensor", "sensors", "ownship", "own", "ego", "platform", "platforms", "observer", "observers",
-}  # fmt: skip
-_KNOWN: Final = _TRUTH | _DETECTION | _POSE | {"ground"}
 # Where a vehicle is told to be is not where anything is.
 _SETPOINT = {"setpoint", "setpoints", "goal", "goals", "cmd", "command", "commanded", "desired", "waypoint", "waypoints"}
 _MAYBE_SETPOINT = re.compile(r"target_(pose|position|point|location|local|global|odom|state)")
 """A name that autopilots use for a set-point, and others for where the target is."""
-_ONLY_WITH: Final = {"TransformStamped": _TRUTH, "GeoJSON": _DETECTION}
+_ONLY_WITH: Final = {"TransformStamped": TRUTH_WORDS, "GeoJSON": DETECTION_WORDS}
 """Presets that are not suggested but for topics with one of these words."""
 _OBSTACLE = {"obstacle", "obstacles", "map", "costmap", "grid", "keepout", "nogo"}
 _TF_SCHEMAS = {"TFMessage", "tfMessage", "TransformStamped", "FrameTransform", "FrameTransforms"}
@@ -97,7 +88,7 @@ def suggest_mapping(channels: Sequence[ChannelLike]) -> SuggestedMapping:
 
 def usable_preset(channel: ChannelLike) -> str | None:
     """The name of the preset by which a channel can be read without being told; None where there is none."""
-    words = _words(channel.topic)
+    words = words_of(channel.topic)
     name = preset_for(channel.schema_name) or ("AIS" if not channel.schema_name and "ais" in words else None)
     if name is None or PRESETS[name].is_suggested or _ONLY_WITH.get(name, set()).intersection(words):
         return name
@@ -117,15 +108,10 @@ def describe_channels(channels: Iterable[ChannelLike]) -> str:
     return ", ".join(named[:8]) + rest if named else "none"
 
 
-def _words(topic: str) -> list[str]:
-    spaced = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", " ", topic)
-    return [word.lower() for word in re.split(r"[^A-Za-z0-9]+", spaced) if word]
-
-
 def _role(channel: ChannelLike) -> Role | None:
     """Schema first, then the words of the name; truth before detection, detection before pose (`/truth/target/pose`)."""
     package, _, kind = normalise_schema(channel.schema_name).rpartition(".")
-    words, preset = _words(channel.topic), usable_preset(channel)
+    words, preset = words_of(channel.topic), usable_preset(channel)
     if kind in _TF_SCHEMAS and preset is None:
         return "tf"
     if (kind in _OBSTACLE_SCHEMAS and preset is None) or (preset == "SceneUpdate" and _OBSTACLE.intersection(words)):
@@ -138,29 +124,29 @@ def _role(channel: ChannelLike) -> Role | None:
         if _PLAIN_DETECTION.intersection(words):
             return "detections"
         return "obstacles" if _OBSTACLE.intersection(words) else None
-    if _TRUTH.intersection(words) or ("ground", "truth") in itertools.pairwise(words):
+    if TRUTH_WORDS.intersection(words) or ("ground", "truth") in itertools.pairwise(words):
         return "truth"
-    if PRESETS[preset].role is not None or _DETECTION.intersection(words):
+    if PRESETS[preset].role is not None or DETECTION_WORDS.intersection(words):
         return PRESETS[preset].role or "detections"
     if preset == "SceneUpdate":
         return None  # a scene without such a name may show anything
-    return "poses" if _POSE.intersection(words) else "positions"
+    return "poses" if POSE_WORDS.intersection(words) else "positions"
 
 
 def _is_setpoint(channel: ChannelLike) -> bool:
-    return normalise_schema(channel.schema_name) in SETPOINTS or not _SETPOINT.isdisjoint(_words(channel.topic))
+    return normalise_schema(channel.schema_name) in SETPOINTS or not _SETPOINT.isdisjoint(words_of(channel.topic))
 
 
 def _may_be_setpoint(topic: str) -> bool:
     parts = topic.split("/")
     doubtful = [part for part in parts if _MAYBE_SETPOINT.fullmatch(part)]
-    return bool(doubtful) and all(_DETECTION.isdisjoint(_words(part)) for part in parts if part not in doubtful)
+    return bool(doubtful) and all(DETECTION_WORDS.isdisjoint(words_of(part)) for part in parts if part not in doubtful)
 
 
 def _why_unused(channel: ChannelLike, role: Role | None) -> str | None:
     """Why a channel that may hold detections is in no source; None for all others."""
     kind = normalise_schema(channel.schema_name).rpartition(".")[2]
-    has_name, has_type = not _PLAIN_DETECTION.isdisjoint(_words(channel.topic)), _DETECTION_TYPE.search(kind) is not None
+    has_name, has_type = not _PLAIN_DETECTION.isdisjoint(words_of(channel.topic)), _DETECTION_TYPE.search(kind) is not None
     if role not in (None, "detections") or channel.topic.startswith(OWN_TOPICS) or not (has_name or has_type):
         return None
     if usable_preset(channel) is not None and role == "detections":
@@ -184,42 +170,8 @@ def _unread_source(channel: ChannelLike) -> SourceConfig:
 def _sources(channels: Sequence[ChannelLike], role: Role) -> tuple[SourceConfig, ...]:
     """One source a pattern: topics of one preset that differ only in a name share it."""
     topics = [channel.topic for channel in channels]
-    found = {(_pattern(c, role, topics), usable_preset(c)): None for c in channels}
+    found = {(pattern_of(c.topic, role, not _holds_several(c), topics), usable_preset(c)): None for c in channels}
     return tuple(SourceConfig(pattern, preset=preset) for pattern, preset in found)
-
-
-def _pattern(channel: ChannelLike, role: Role, topics: Sequence[str]) -> str:
-    """The topic with placeholders where names stand beside words of roles.
-
-    /truth/A7 → /truth/{agent}, /cub1/pose → /{agent}/pose; of a detection the name before the word is who sees, the name
-    after it who is seen: /camera/contacts/A7 → /{sensor}/contacts/{agent}. Names in `topics` tell which part varies. Messages
-    that name agents themselves need no name of the topic.
-    """
-    parts = channel.topic.split("/")
-    needs_agent = not _names_agents(channel)
-    is_word = [bool(part) and not _KNOWN.isdisjoint(_words(part)) for part in parts]
-    names = [i for i, part in enumerate(parts) if part and not is_word[i]]
-    if not any(is_word) or not names:
-        return channel.topic
-    varying = _varying(parts, names, topics)
-    if role == "detections":
-        word = max(i for i, known in enumerate(is_word) if known)
-        for placeholder, places in (("sensor", [i for i in names if i < word]), ("agent", [i for i in names if i > word])):
-            if places and (placeholder == "sensor" or needs_agent):
-                parts[next((i for i in reversed(places) if i in varying), places[-1])] = f"{{{placeholder}}}"
-    elif role == "poses" or needs_agent:
-        parts[varying[-1] if varying else names[-1]] = "{sensor}" if role == "poses" else "{agent}"
-    return "/".join(parts)
-
-
-def _varying(parts: Sequence[str], names: Sequence[int], topics: Sequence[str]) -> list[int]:
-    """The places of `names` in which some other topic differs from this one, and in no other part."""
-    found: set[int] = set()
-    for other in (topic.split("/") for topic in topics):
-        if len(other) == len(parts):
-            different = [i for i, (mine, its) in enumerate(zip(parts, other, strict=True)) if mine != its]
-            found.update(different if len(different) == 1 else ())
-    return [i for i in names if i in found]
 
 
 def _name_only_agent(
@@ -237,6 +189,12 @@ def _name_only_agent(
     identified = {c.topic for c in channels if b"agent_id" in c.schema_data or _names_agents(c)}
     is_named = [source.topic in identified or "{agent}" in source.topic for source in detections]
     return tuple(s if known else replace(s, agent=named[0]) for s, known in zip(detections, is_named, strict=True))
+
+
+def _holds_several(channel: ChannelLike) -> bool:
+    """Whether the name of the topic cannot be that of who was seen: messages name agents, or hold several."""
+    preset = usable_preset(channel)
+    return preset is not None and (PRESETS[preset].names_agents or PRESETS[preset].is_array)
 
 
 def _names_agents(channel: ChannelLike) -> bool:

@@ -59,6 +59,11 @@ class Preset:
     names_agents: bool = False
     is_suggested: bool = True
 
+    @property
+    def is_array(self) -> bool:
+        """Whether a message may hold several positions."""
+        return any("[:]" in path for path in (*self.x, *self.latitude))
+
 
 def metric(schema: str, *points: str) -> Preset:
     """Positions in metres at alternative paths of something with x, y and z ("" for the message itself)."""

@@ -19,6 +19,7 @@ FACTS = {
 
 LEFT_OUT = {
     "collapsed": "simultaneous detections merged into others",
+    "disagreeing": "simultaneous detections that do not agree with the most accurate one, left out",
     "undecodable": "messages that cannot be decoded",
     "incomplete": "messages without a position where the mapping looks",
     "no_fix": "positions marked as having no fix, or as not valid",

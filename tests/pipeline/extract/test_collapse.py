@@ -32,9 +32,9 @@ def test_copies_become_one() -> None:
 
 
 def test_inverse_covariance_weighting() -> None:
-    found = collapse(positions((0, 0, 0, (1, 0, 4), "T", None), (0, 10, 10, (3, 0, 4), "T", None)), 0.0)
-    assert found.positions.first[0] == pytest.approx(2.5)  # weights 3/4 and 1/4
-    assert found.positions.second[0] == pytest.approx(5.0)
+    found = collapse(positions((0, 0, 0, (1, 0, 4), "T", None), (0, 6, 6, (3, 0, 4), "T", None)), 0.0)
+    assert found.positions.first[0] == pytest.approx(1.5)  # weights 3/4 and 1/4
+    assert found.positions.second[0] == pytest.approx(3.0)
     np.testing.assert_allclose(found.positions.covariance_m2[0], [0.75, 0.0, 2.0])
     assert found.positions.sensor[0] is None
 
@@ -48,8 +48,21 @@ def test_exact_detections_leave_nothing_to_say_for_others() -> None:
 
 def test_other_agents_unknown_origins_and_later_moments_stay() -> None:
     rows = positions((0, 0, 0, EXACT, "T", None), (0, 0, 0, EXACT, "U", None), (0, 0, 0, EXACT, None, None),
-                     (0, 0, 0, EXACT, None, None), (2, 0, 0, EXACT, "T", None))  # fmt: skip
-    assert collapse(rows, 0.001).num_merged.tolist() == [1, 1, 1, 1, 1]
+                     (0, 0, 1, EXACT, None, None), (1, 0, 0, EXACT, None, None), (2, 0, 0, EXACT, "T", None))  # fmt: skip
+    assert collapse(rows, 0.001).num_merged.tolist() == [1] * 6
+
+
+def test_of_unknown_origin_only_copies_are_one() -> None:
+    rows = positions((0, 0, 0, EXACT, None, "a"), (0, 5, 5, EXACT, None, "a"), (0, 0, 0, EXACT, None, "b"))
+    found = collapse(rows, 0.001)
+    assert found.num_merged.tolist() == [2, 1] and found.positions.sensor.tolist() == ["a+b", "a"]
+
+
+def test_views_that_do_not_agree_are_not_averaged() -> None:
+    rows = positions((0, 0, 0, (9, 0, 9), "T", "a"), (0, 50, 0, (1, 0, 1), "T", "b"), (0, 51, 0, (4, 0, 4), "T", "c"))
+    found = collapse(rows, 0.001)
+    assert found.num_disagreeing == 1 and found.num_merged.tolist() == [2] and found.positions.sensor.tolist() == ["b+c"]
+    assert found.positions.first[0] == pytest.approx(50.2)  # weights 4/5 and 1/5
 
 
 def test_a_dense_track_is_cut_into_pieces_of_the_tolerance() -> None:

@@ -1,68 +1,107 @@
-"""Names that cannot say who was seen, and those that can."""
+"""Who was seen, through whole logs as detectors and trackers write them."""
+
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-
-from pipeline.extract.identity import without_false_names
-from pipeline.extract.plausibility import Suspicions
-from pipeline.extract.positions import Positions, Rows
-
-NAN = float("nan")
+from fixtures.small_logs import Row, detection, stamp
+from test_extract import Extracted, run
 
 
-def rows(*items: tuple[int, float, float, float, str | None], sigma_m: float = NAN) -> Positions:
-    """(message, seconds, x, y, agent) a row."""
-    built = Rows()
-    for message, second, x, y, agent in items:
-        time_ns = round(second * 1e9)
-        built.integers.extend((time_ns, time_ns, message, message))
-        built.floats.extend((x, y, NAN, NAN, sigma_m**2, 0.0 * sigma_m, sigma_m**2, NAN, NAN, NAN))
-        built.agents.append(agent)
-        built.sensors.append(None)
-        built.frame_ids.append("map")
-    return built.finish("/seen")
+def array(topic: str, second: float, places: list[tuple[float, float]], names: list[str] | None = None) -> Row:
+    """A message of several positions: `vision_msgs/Detection3DArray` with names, `geometry_msgs/PoseArray` without."""
+    header = {"stamp": stamp(second), "frame_id": "map"}
+    positions = [{"x": x, "y": y, "z": 0.0} for x, y in places]
+    if names is None:
+        return Row(topic, "geometry_msgs/PoseArray", second, {"header": header, "poses": [{"position": p} for p in positions]})
+    items = [{"id": name, "bbox": {"center": {"position": p}}} for name, p in zip(names, positions, strict=True)]
+    return Row(topic, "vision_msgs/Detection3DArray", second, {"header": header, "detections": items})
 
 
-def judged(found: Positions, *believed: str) -> tuple[list[str | None], list[str]]:
-    suspicions = Suspicions()
-    return without_false_names(found, 0.001, believed, suspicions).agent.tolist(), suspicions.lines()
+def objects(topic: str, second: float, places: list[tuple[float, float]], kind: str, names: list[str] | None = None) -> Row:
+    """autoware's objects of one kind: detected, tracked or predicted."""
+    first = "initial_pose_with_covariance" if kind == "Predicted" else "pose_with_covariance"
+    items: list[dict[str, Any]] = [
+        {"kinematics": {first: {"pose": {"position": {"x": x, "y": y, "z": 0.0}}}}} for x, y in places
+    ]
+    for item, name in zip(items, names or (), strict=False):
+        item["object_id"] = {"uuid": list(name.encode() * 16)}
+    message = {"header": {"stamp": stamp(second), "frame_id": "map"}, "objects": items}
+    return Row(topic, f"autoware_perception_msgs/msg/{kind}Objects", second, message)
 
 
-def test_a_name_of_two_places_in_one_message_is_nobody() -> None:
-    shared = [(i, float(i), 2.0 * i, y, "T") for i in range(20) for y in (0.0, 50.0)]
-    alone = [(i, float(i), 2.0 * i, 99.0, "B") for i in range(20)]
-    names, lines = judged(rows(*shared, *alone))
-    assert names == [None] * 40 + ["B"] * 20
-    assert len(lines) == 1 and '20 of 20 messages have "T" at several places; 40 detections' in lines[0]
-    assert judged(rows(*shared, *alone), "/seen") == (["T"] * 40 + ["B"] * 20, [])
+def agents(found: Extracted) -> dict[str | None, int]:
+    names = found.detections["agent_id"].to_pylist()
+    return {name: names.count(name) for name in dict.fromkeys(names)}
 
 
-def test_one_slip_of_a_tracker_costs_only_that_message() -> None:
-    items = [(i, float(i), 2.0 * i, 0.0, "T") for i in range(40)]
-    names, lines = judged(rows(*items, (7, 7.0, 14.0, 30.0, "T")))
-    assert names == ["T"] * 7 + [None] + ["T"] * 32 + [None]
-    assert '1 of 40 messages have "T" at several places; 2 detections' in lines[0]
+def kinds(found: Extracted) -> list[str]:
+    return [record["kind"] for record in found.summary["suspicions"]]
 
 
-@pytest.mark.parametrize(
-    "items",
-    [
-        [(i, float(i), 2.0 * i, 0.0, name) for i in range(9) for name in "AB"],  # two names
-        [(i, float(i), 2.0 * i, 0.0, "T") for i in range(9) for _ in "ab"],  # copies
-        [(i, i + 0.1 * part, 2.0 * i + part, 0.0, "T") for i in range(9) for part in range(3)],  # a track's last three moments
-        [(2 * i + part, float(i), 2.0 * i, 9.0 * part, "T") for i in range(9) for part in range(2)],  # two messages
-        [(i, float(i), 2.0 * i, y, None) for i in range(9) for y in (0.0, 9.0)],  # no names at all
-    ],
-)  # fmt: skip
-def test_names_that_may_well_be_meant_stay(items: list[tuple[int, float, float, float, str | None]]) -> None:
-    assert judged(rows(*items)) == ([item[4] for item in items], [])
+def test_a_detector_that_never_fills_in_its_ids(tmp_path: Path) -> None:
+    lanes = [(0.0, "0" * 32), (100.0, "0" * 32), (200.0, "0" * 32)]
+    for num in (1, 3):  # also where only one is seen
+        rows = [
+            array("/radar/tracks", i, [(5.0 * i, y) for y, _ in lanes[:num]], [n for _, n in lanes[:num]]) for i in range(20)
+        ]
+        found = run(tmp_path, rows)
+        assert agents(found) == {None: 20 * num} and kinds(found) == ["identity"]
+        assert sorted(set(found.detections["y_m"].to_pylist())) == [y for y, _ in lanes[:num]]
 
 
-def test_views_that_agree_within_their_accuracy_are_of_one_agent() -> None:
-    items = [(i, float(i), 2.0 * i, y, "T") for i in range(9) for y in (0.0, 5.0)]
-    assert judged(rows(*items, sigma_m=0.8))[0] == [None] * 18  # 5 m are 4.4 standard deviations of their difference
-    assert judged(rows(*items, sigma_m=1.0)) == (["T"] * 18, [])
+def test_a_named_topic_of_arrays_is_a_sensors(tmp_path: Path) -> None:
+    rows = [array("/detections/lidar_front", i, [(3.0 * i, y) for y in (0.0, 300.0, 600.0)]) for i in range(20)]
+    found = run(tmp_path, rows)
+    assert agents(found) == {None: 60} and kinds(found) == []
+    assert set(found.detections["sensor_id"].to_pylist()) == {"lidar_front"}
+    assert found.detections["y_m"].to_pylist() == [0.0, 300.0, 600.0] * 20
 
 
-def test_nothing_at_all_is_no_suspicion() -> None:
-    assert judged(rows()[:0]) == ([], []) and np.size(rows((1, 0.0, 1.0, 1.0, "T")).agent) == 1
+def test_the_stages_of_a_pipeline_count_once(tmp_path: Path) -> None:
+    rng, rows = np.random.default_rng(0), []
+    for i in range(30):
+        places = [(8.0 * i, 0.0), (300 - 6.0 * i, 7.0)]
+        noisy = [(x + rng.normal(0, 0.3), y + rng.normal(0, 0.3)) for x, y in places]
+        rows.append(objects("/perception/object_recognition/detection/objects", i, noisy, "Detected"))
+        rows.append(objects("/perception/object_recognition/tracking/objects", i, places, "Tracked", ["a", "b"]))
+        rows.append(objects("/perception/object_recognition/objects", i, places, "Predicted", ["a", "b"]))
+    found = run(tmp_path, rows)
+    assert agents(found) == {"61" * 16: 30, "62" * 16: 30} and kinds(found) == ["stage"]
+    assert found.summary["sources"]["detections"] == ["/perception/object_recognition/tracking/objects"]
+    wanted = {"topic": "/perception/object_recognition/detection/objects"}
+    assert agents(run(tmp_path, rows, detections=[wanted])) == {None: 60}
+
+
+def test_a_number_that_is_given_out_again_is_another_target(tmp_path: Path) -> None:
+    rows = [array("/radar/detections", i, [(10.0 * i, 0.0)], ["7"]) for i in range(30)]
+    rows += [array("/radar/detections", i, [(400 - 8.0 * (i - 33), 350.0)], ["7"]) for i in range(33, 63)]
+    found = run(tmp_path, rows)
+    assert agents(found) == {"7": 30, "7.2": 30} and kinds(found) == ["identity"]
+    stated = {"topic": "/radar/detections", "has_identity": True}
+    assert agents(run(tmp_path, rows, detections=[stated])) == {"7": 60}
+    assert kinds(run(tmp_path, rows, detections=[stated | {"has_identity": False}])) == []
+
+
+@pytest.mark.parametrize("name", ["unknown", "-1", "", "None"])
+def test_a_name_that_says_that_there_is_none_is_none(name: str, tmp_path: Path) -> None:
+    rows = [detection(float(i), 3.0 * i, 0.0, agent_id=name) for i in range(9)]
+    found = run(tmp_path, rows)
+    assert agents(found) == {None: 9} and kinds(found) == []
+
+
+def test_copies_of_one_message_are_one_detection(tmp_path: Path) -> None:
+    rows = [array("/detections", float(i), [(3.0 * i, 0.0), (5.0, 9.0)]) for i in range(9)]
+    found = run(tmp_path, [copy for row in rows for copy in (row, row)])
+    assert agents(found) == {None: 18} and found.detections["num_merged"].to_pylist() == [2] * 18
+
+
+def test_sensors_that_contradict_each_other_are_told(tmp_path: Path) -> None:
+    rows = []
+    for i in range(20):
+        for sensor, y in (("a", 0.0), ("b", 3.0 if i % 2 else 30.0)):
+            rows.append(detection(float(i), 9.0 * i, y, agent_id="T", sensor=sensor, position_covariance=[1.0, 0, 0, 1.0]))
+    found = run(tmp_path, rows)
+    assert agents(found) == {"T": 20} and kinds(found) == ["covariance"] and found.summary["disagreeing"] == 10
+    assert found.detections["y_m"].to_pylist() == [0.0, 1.5] * 10

@@ -1,0 +1,117 @@
+"""Names that several targets bear, at once or one after the other.
+
+A small number that a tracker gives out anew, sensors that count for themselves, a kind in place of a name.
+"""
+
+from collections import defaultdict
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Final
+
+import numpy as np
+
+from pipeline.arrays import Int64s, Objects
+from pipeline.extract.names import Naming
+from pipeline.extract.plausibility import Suspicions, listed
+from pipeline.extract.positions import Positions, numbered
+from pipeline.extract.tracks import Jump, Track, apart_m, odd_share, pieces_of
+
+_MAX_ODD: Final = 0.3
+"""Of the steps of a name: noise alone makes a target seem to leave and come back in one step of twelve."""
+_MIN_ROWS: Final = 4
+_SETTING: Final = "has_identity (true: names are believed, false: none is) in its [[extract.detections]]"
+
+
+@dataclass
+class _Found:
+    """What was found on one set of topics: names by fault, with the numbers of the worst case and of what became of them."""
+
+    apart: dict[str, float] = field(default_factory=dict)
+    odd: dict[str, int] = field(default_factory=dict)
+    jumps: dict[str, Jump] = field(default_factory=dict)
+    num_agents: int = 0
+
+
+def without_reused_names(rows: Positions, tolerance_s: float, naming: Naming, suspicions: Suspicions) -> Positions:
+    """The rows [N] of detections, in metres and sorted by time, with names that mean one agent each.
+
+    A name that several agents bear becomes several names; one that means no agent is taken away. Moments are the same within
+    `tolerance_s`.
+    """
+    if not suspicions.looks_for("identity") or len(rows) == 0:
+        return rows
+    agent, found = rows.agent.copy(), defaultdict[str, _Found](_Found)
+    track, names = _track(rows), set(rows.agent)
+    for name, chosen in _by_name(rows):
+        if len(chosen) >= _MIN_ROWS and not any(topic in naming.believed for topic in set(rows.topic[chosen])):
+            told = found[", ".join(dict.fromkeys(rows.topic[chosen]))]
+            sources = _by_source(rows, chosen)
+            for part_name, parts in _apart(track, name, sources, told).items():
+                agent[np.sort(np.concatenate(parts))] = _renamed(track, part_name, parts, tolerance_s, names, told)
+    for topics, told in found.items():
+        _tell(topics, told, suspicions)
+    return replace(rows, agent=agent)
+
+
+def _track(rows: Positions) -> Track:
+    time_s = (rows.time_ns - rows.time_ns[0]).astype(np.float64) * 1e-9
+    return Track(time_s, rows.first + 1j * rows.second, np.nan_to_num(rows.covariance_m2[:, [0, 2]].max(axis=1)))
+
+
+def _by_name(rows: Positions) -> Iterator[tuple[str, Int64s]]:
+    """Every name and its row numbers."""
+    number = numbered(rows.agent)
+    order = np.argsort(number, kind="stable")
+    for chosen in np.split(order, np.flatnonzero(np.diff(number[order])) + 1):
+        if number[chosen[0]] >= 0:
+            yield str(rows.agent[chosen[0]]), chosen
+
+
+def _by_source(rows: Positions, chosen: Int64s) -> dict[str, Int64s]:
+    """The row numbers of a name by who says so: topic and sensor."""
+    pairs = zip(rows.topic[chosen], rows.sensor[chosen], strict=True)
+    source = np.array([f"{topic.strip('/')} {sensor or ''}".strip() for topic, sensor in pairs], dtype=object)
+    return {each: chosen[source == each] for each in dict.fromkeys(source)}
+
+
+def _apart(track: Track, name: str, sources: Mapping[str, Int64s], told: _Found) -> dict[str, list[Int64s]]:
+    """The row numbers of each source by the name of the agent: that of all, or one a source where they mean different ones."""
+    distance_m = apart_m([track[part] for part in sources.values()]) if len(sources) > 1 else 0.0
+    if not distance_m:
+        return {name: list(sources.values())}
+    told.apart[name] = distance_m
+    return {f"{source}/{name}": [part] for source, part in sources.items()}
+
+
+def _renamed(
+    track: Track, name: str, parts: Sequence[Int64s], tolerance_s: float, names: Collection[str], told: _Found
+) -> Objects:
+    """What each row [N] of an agent, seen by several sources, is called; None where nothing is known."""
+    rows = np.sort(np.concatenate(parts))
+    odd = sum(odd_share(track[part], tolerance_s) * len(part) for part in parts)
+    if odd > _MAX_ODD * len(rows):
+        told.odd[name] = len(rows)
+        return np.full(len(rows), None, dtype=object)
+    piece, jump = pieces_of(track[rows], tolerance_s)
+    if jump is not None:
+        told.jumps[name] = jump
+        told.num_agents += int(piece.max()) + 1
+    mark = "." if f"{name}.2" not in names else ".reused."
+    return np.array([name if number == 0 else f"{name}{mark}{number + 1}" for number in piece.tolist()], dtype=object)
+
+
+def _tell(topics: str, told: _Found, suspicions: Suspicions) -> None:
+    if told.apart:
+        far_m = max(told.apart.values())
+        seen = f"sources put {listed(told.apart)} up to {far_m:.4g} m apart at one moment"
+        suspicions.add("identity", topics, seen=seen, done="names of different sources are different agents", setting=_SETTING)
+    if told.odd:
+        seen = f"{listed(told.odd)} would be at several places at once, or leave and come back faster than anything moves"
+        done = f"{sum(told.odd.values())} detections are of unknown origin"
+        suspicions.add("identity", topics, seen=seen, done=done, setting=_SETTING)
+    if told.jumps:
+        name, jump = max(told.jumps.items(), key=lambda item: item[1].ratio)
+        far = f'"{name}" jumps {jump.length_m:.4g} m in {jump.time_s:.3g} s, {jump.ratio:.3g} times its speed'
+        more = f", and {len(told.jumps) - 1} more names jump" if len(told.jumps) > 1 else ""
+        done = f"{len(told.jumps)} names became {told.num_agents} agents ({name}, {name}.2, ...)"
+        suspicions.add("identity", topics, seen=far + more, done=done, setting=_SETTING)
