@@ -132,11 +132,15 @@ def row(key: str, name: str, own: EpisodeScores, first: EpisodeScores, unit_m: f
 
 
 def section(measured: Measurement) -> str:
-    """What a share of hypotheses out of the library with the most tracks changes in the energy score."""
-    name = measured.rows()[-1]["forecast"]
-    rows = measured.rows(forecast=name)
-    lines = [[row["set"], publishing.interval(row, "worse_than_cadence_percent", "z.0f")] for row in rows]
-    return publishing.table(["set", f"{name}: worse than CADENCE alone, %"], lines)
+    """What the library with the most tracks is worth, by itself and as a share of the hypotheses."""
+    names = [measured.rows()[index]["forecast"] for index in (-2, -1)]
+    heads = ["energy score, worse than CADENCE alone, %", *names]
+    worse = {
+        name: [publishing.interval(row, "worse_than_cadence_percent", "z.0f") for row in measured.rows(forecast=name)]
+        for name in names
+    }
+    sets = [row["set"] for row in measured.rows(forecast=names[-1])]
+    return publishing.table(heads, [[name, *cells] for name, *cells in zip(sets, *worse.values(), strict=True)])
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
