@@ -191,3 +191,9 @@ def test_no_two_test_files_share_a_name():
     """Pytest would refuse the second, but only where both are collected in one run."""
     names = Counter(path.name for path in (ROOT / "tests").rglob("*.py"))
     assert [name for name, count in names.items() if count > 1] == []
+
+
+def test_every_test_file_has_a_name_of_its_own():
+    # pytest imports them by their names alone
+    names = [path.name for path in (ROOT / "tests").rglob("test_*.py")]
+    assert len(names) == len(set(names)), sorted({name for name in names if names.count(name) > 1})
