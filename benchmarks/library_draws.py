@@ -133,14 +133,13 @@ def row(key: str, name: str, own: EpisodeScores, first: EpisodeScores, unit_m: f
 
 def section(measured: Measurement) -> str:
     """What the library with the most tracks is worth, by itself and as a share of the hypotheses."""
-    names = [measured.rows()[index]["forecast"] for index in (-2, -1)]
-    heads = ["energy score, worse than CADENCE alone, %", *names]
-    worse = {
-        name: [publishing.interval(row, "worse_than_cadence_percent", "z.0f") for row in measured.rows(forecast=name)]
-        for name in names
-    }
-    sets = [row["set"] for row in measured.rows(forecast=names[-1])]
-    return publishing.table(heads, [[name, *cells] for name, *cells in zip(sets, *worse.values(), strict=True)])
+    alone, shared = (measured.rows(forecast=measured.rows()[index]["forecast"]) for index in (-2, -1))
+    column = "worse_than_cadence_percent"
+    lines = [
+        [row["set"], *(publishing.interval(one, column, "z.0f") for one in (row, other))]
+        for row, other in zip(alone, shared, strict=True)
+    ]
+    return publishing.table(["worse than CADENCE, %", alone[0]["forecast"], shared[0]["forecast"]], lines)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -35,6 +35,7 @@ PAGES = {
     "association": ("association",),
     "logs": ("log_reading", "log_writing"),
     "runs": ("batch", "batch_engines", "memory", "many_agents"),
+    "rivals": (),
 }
 """The scripts whose sections stand on a page."""
 
