@@ -7,10 +7,11 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Final, NoReturn
 
 from cadence.errors import CadenceError, InputError, UsageError
 from pipeline.documents import parse_json
+from pipeline.logs.foreign import recordings_below
 from pipeline.logs.parts import METADATA_NAME, group_parts, mission_name, named_parts
 from pipeline.stores.objects import StoredObject, find_objects, read_bytes
 from pipeline.stores.urls import is_url, shown, url_name
@@ -24,7 +25,8 @@ REPORT_NAME: Final = "batch.json"
 _TAKEN_NAMES: Final = (REPORT_NAME, "scores.json", "scores.csv", "scores.md")
 """Files beside mission directories: a log may be called batch.json.mcap."""
 
-_OWN_ENDINGS: Final = (".cadence.mcap", ".combined.mcap")
+_SIDE_ENDING: Final = ".cadence.mcap"
+_OWN_ENDINGS: Final = (_SIDE_ENDING, ".combined.mcap")
 
 
 @dataclass(frozen=True)
@@ -79,13 +81,28 @@ def _paths(text: str) -> Iterator[Path]:
     """The files that one argument means. A path that leads nowhere stays: its own failure will say so."""
     path = Path(text)
     if path.is_dir():
-        yield from _some(_logs_below(path), f"{text}: holds no MCAP log; name a log or another folder")
+        yield from _logs_below(path) or _refused(path)
+    elif path.name.endswith(_SIDE_ENDING):
+        raise InputError(f"{text}: was written by cadence export; name the log that it belongs to")
     elif path.exists() or not glob.has_magic(text):
         yield path
     else:
         found = [Path(name) for name in sorted(glob.glob(text, recursive=True))]  # noqa: PTH207 (Path.glob: no absolute ones)
         logs = [log for each in found for log in (_logs_below(each) if each.is_dir() else [each] if _is_log(each) else [])]
-        yield from _some(logs, f"{text}: no MCAP log fits this pattern; correct it")
+        if not logs:
+            raise InputError(f"{text}: no MCAP log fits this pattern; correct it")
+        yield from logs
+
+
+def _refused(folder: Path) -> NoReturn:
+    """Says of a folder without logs what it is instead, and the way on."""
+    if is_mission_directory(folder):
+        log = _ingested_log(folder)
+        raise InputError(f"{folder}: is a mission directory, not a folder of logs; its log is {log or 'a fetched one'}")
+    foreign = recordings_below(folder)
+    if foreign:
+        raise InputError(f"{folder}: holds no MCAP log; {foreign}")
+    raise InputError(f"{folder}: holds no MCAP log; name a log or another folder")
 
 
 def _objects(url: str) -> tuple[StoredObject, ...]:
@@ -129,12 +146,6 @@ def _named_in(folder: str, is_listed: bool) -> list[str]:
         if is_listed:
             raise
         return []
-
-
-def _some(logs: list[Path], otherwise: str) -> list[Path]:
-    if not logs:
-        raise InputError(otherwise)
-    return logs
 
 
 def _logs_below(folder: Path) -> list[Path]:

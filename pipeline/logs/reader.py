@@ -12,6 +12,7 @@ from cadence.errors import InputError
 from pipeline.logs.channels import Batch as Batch
 from pipeline.logs.channels import Channel as Channel
 from pipeline.logs.channels import RawMessage as RawMessage
+from pipeline.logs.foreign import HEAD_BYTES, kind_of
 from pipeline.logs.health import Health as Health
 from pipeline.logs.health import health_of, united_health
 from pipeline.logs.health import utc as utc
@@ -24,15 +25,6 @@ from pipeline.logs.timeline import Selection, Source, Timeline, read_span, readi
 from pipeline.logs.uniting import unite
 
 OnBytes = Callable[[int], object]
-_FOREIGN_MAGIC = {
-    b"#ROSBAG": "a ROS 1 bag; convert it with `mcap convert in.bag out.mcap`",
-    b"SQLite ": "a rosbag2 SQLite file; convert it with `ros2 bag convert` or `mcap convert in.db3 out.mcap`",
-    b"PAR1": "a Parquet file",
-    b"\x1f\x8b": "compressed with gzip; unpack it first",
-    b"\x28\xb5\x2f\xfd": "compressed with zstd; unpack it first",
-    b"PK\x03\x04": "a ZIP archive; unpack it first",
-    MAGIC[:5]: "an MCAP of another version, or one whose line ends a copy has changed; copy it in binary mode",
-}
 
 
 @dataclass(frozen=True)
@@ -198,7 +190,7 @@ def _check_magic(path: Path) -> int:
         raise InputError(f"{path}: is a folder; give the .mcap file inside it")
     try:
         with path.open("rb") as file:
-            head = file.read(len(MAGIC))
+            head = file.read(HEAD_BYTES)
             size = file.seek(0, 2)
     except FileNotFoundError as error:
         raise InputError(f"{path}: not found; check the path") from error
@@ -206,9 +198,8 @@ def _check_magic(path: Path) -> int:
         raise InputError(f"{path}: cannot be read ({error}); check the permissions") from error
     if size == 0:
         raise InputError(f"{path}: is empty; nothing was recorded, or the copy failed")
-    if head != MAGIC and not head.startswith(TEXT_MAGIC):
-        kind = next((text for magic, text in _FOREIGN_MAGIC.items() if head.startswith(magic)), "something else")
-        raise InputError(f"{path}: is not an MCAP file but {kind}")
+    if not head.startswith((MAGIC, TEXT_MAGIC)):
+        raise InputError(f"{path}: is not an MCAP file but {kind_of(path, head)}")
     return size
 
 

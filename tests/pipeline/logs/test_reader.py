@@ -140,7 +140,7 @@ def test_log_without_messages_opens(write_log):
         (b"not a log at all, but long enough", "not an MCAP"),
         (b"\x89MCA", "not an MCAP"),
         (b"#ROSBAG V2.0\n" + bytes(100), "ROS 1 bag"),
-        (b"SQLite format 3\x00" + bytes(100), "mcap convert"),
+        (b"SQLite format 3\x00" + bytes(100), "rosbags-convert"),
         (b"\x1f\x8b" + bytes(100), "gzip"),
     ],
 )
