@@ -11,6 +11,8 @@ from pipeline.logs.reader import Batch, MissionLog
 _MIN_GAP_S = 60.0
 _GAP_FACTOR = 100.0
 """Silence is worth a word where it is so long, and so many times the usual time between two messages."""
+_BEATS, _BEAT_FACTOR = 10, 3.0
+"""So many silences that make up most of a recording are its beat; a gap is longer than they usually are."""
 _JUMP_S = 10.0
 _MAX_OFFSET_S = 10 * 366 * 86400.0
 """Log and publish time further apart say nothing: recorders that have no publish time write what they like."""
@@ -82,7 +84,11 @@ def _gaps(time_ns: Int64s, lost_spans_ns: tuple[tuple[int, int], ...]) -> list[s
     """The longest stretches between sorted times in which nothing was recorded, those apart in which messages were lost."""
     length = np.diff(time_ns) * 1e-9
     usual = float(np.median(length)) if len(length) else 0.0
-    long = np.flatnonzero(length > max(_MIN_GAP_S, _GAP_FACTOR * usual))
+    least_s = max(_MIN_GAP_S, _GAP_FACTOR * usual)
+    silences = length[length > least_s]
+    if len(silences) >= _BEATS and silences.sum() > 0.5 * length.sum():  # bursts at a steady beat are no recorder that failed
+        least_s = max(least_s, _BEAT_FACTOR * float(np.median(silences)))
+    long = np.flatnonzero(length > least_s)
     spans = [(int(time_ns[i]), int(time_ns[i + 1]), float(length[i])) for i in long]
     spans = [span for span in spans if not any(first < span[1] and last > span[0] for first, last in lost_spans_ns)]
     chosen = sorted(sorted(spans, key=lambda span: -span[2])[:_MAX_SENTENCES])

@@ -151,6 +151,13 @@ def test_long_silence_is_named(examined: Callable[[bytes], Diagnosis]) -> None:
     assert not examined(recorded(steady(step_s=300.0))).gaps  # a slow log is not silent
 
 
+def test_bursts_at_a_steady_beat_are_no_gaps_and_a_missed_beat_is(examined: Callable[[bytes], Diagnosis]) -> None:
+    beats = [(60.0 * beat + 0.001 * i, 60.0 * beat, 20 * beat + i) for beat in range(30) for i in range(20)]
+    assert not examined(recorded(beats)).gaps
+    (gap,) = examined(recorded([message for message in beats if not 600 < message[1] < 1000])).gaps
+    assert "(420 s)" in gap
+
+
 def test_many_gaps_make_few_sentences(examined: Callable[[bytes], Diagnosis]) -> None:
     times = [(i + 1000.0 * (i // 10), i, i) for i in range(100)]
     gaps = examined(recorded(times)).gaps
