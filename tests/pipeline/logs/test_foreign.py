@@ -71,7 +71,7 @@ def test_bags_are_told_how_to_become_logs(name, tmp_path):
 
 def test_a_table_is_told_where_it_says_how_and_that_works(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    rows = [f"{1_700_000_000 + i},{3 * i},{2 * i},boat" for i in range(20)]
+    rows = [f"{1_700_000_000 + i},{3 * i},{2 * i},ferry-7" for i in range(20)]
     (tmp_path / "plots.csv").write_text("\n".join(["time_s,x_m,y_m,agent", *rows]) + "\n")
     with pytest.raises(InputError, match=r"plots\.csv: is not an MCAP file but a table as text; docs/formats\.md shows how"):
         open_log("plots.csv")
@@ -83,7 +83,7 @@ def test_a_table_is_told_where_it_says_how_and_that_works(tmp_path, monkeypatch)
     (tmp_path / "out").mkdir()
     write_tables(open_log("plots.mcap"), tmp_path / "out", config, Progress(quiet=True))
     table, _ = read_table(tmp_path / "out" / "detections.parquet", "detections")
-    assert table["x_m"].to_pylist() == [3 * i for i in range(20)] and set(table["agent_id"].to_pylist()) == {"boat"}
+    assert table["x_m"].to_pylist() == [3 * i for i in range(20)] and set(table["agent_id"].to_pylist()) == {"ferry-7"}
 
 
 def test_folders_without_logs_say_what_they_are(tmp_path, capsys):
