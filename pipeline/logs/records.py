@@ -1,8 +1,7 @@
 """Records and chunks of an MCAP as bytes, read strictly: every foreign error becomes `DamagedRecord` here.
 
-The only place that calls the decompressors and the record parsers of `mcap`, so that the rest of the house knows one
-kind of damage. Sizes that a file declares are never believed before they are checked: a short file cannot make us
-allocate much.
+The only place that calls the record parsers of `mcap` and unpacks chunks, so that the rest of the house knows one kind of
+damage. Sizes that a file declares are never believed before they are checked: a short file cannot make us allocate much.
 """
 
 import contextlib
@@ -12,7 +11,6 @@ from dataclasses import dataclass, field
 from io import BytesIO
 from typing import Final
 
-import lz4.frame
 import numpy as np
 import numpy.typing as npt
 import zstandard
@@ -21,6 +19,8 @@ from mcap.data_stream import ReadDataStream
 from mcap.exceptions import EndOfFile, McapError
 from mcap.opcode import Opcode
 from zlib_ng.zlib_ng import crc32
+
+from pipeline.logs.compression import unpack_lz4, unpack_zstd
 
 MAGIC: Final = b"\x89MCAP0\r\n"
 TEXT_MAGIC: Final = b"\x89MCAP0\n"
@@ -165,9 +165,9 @@ def unpack_cut_chunk(body: bytes) -> tuple[PackedChunk, bytes]:
         compression = body[CHUNK_HEAD.size : CHUNK_HEAD.size + name_length].decode()
         data = body[CHUNK_HEAD.size + name_length + 8 :]
         if compression == "zstd":
-            data = zstandard.ZstdDecompressor().stream_reader(BytesIO(data)).read(min(size, MAX_CHUNK_BYTES))
+            data = unpack_zstd(data, min(size, MAX_CHUNK_BYTES), is_cut=True)
         elif compression == "lz4":
-            data = lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=min(size, MAX_CHUNK_BYTES))
+            data = unpack_lz4(data, min(size, MAX_CHUNK_BYTES))
         elif compression:
             raise DamagedRecord(f"it uses the compression {compression!r}, which is not known")
     return PackedChunk(start, end, size, crc, compression, memoryview(b"")), data
@@ -187,14 +187,9 @@ def _decompress(chunk: PackedChunk) -> bytes:
     if chunk.uncompressed_size == 0 and not chunk.data:
         return b""
     if chunk.compression == "zstd":
-        declared = zstandard.frame_content_size(chunk.data)
-        if declared > MAX_CHUNK_BYTES:
-            raise DamagedRecord(f"its content declares {declared} bytes, more than the limit of {MAX_CHUNK_BYTES}")
-        return zstandard.ZstdDecompressor().decompress(chunk.data, max_output_size=chunk.uncompressed_size)
+        return unpack_zstd(chunk.data, chunk.uncompressed_size)
     if chunk.compression == "lz4":
-        decompressor = lz4.frame.LZ4FrameDecompressor()
-        data: bytes = decompressor.decompress(chunk.data, max_length=chunk.uncompressed_size + 1)
-        return data
+        return unpack_lz4(chunk.data, chunk.uncompressed_size)
     raise DamagedRecord(f"it uses the compression {chunk.compression!r}, which is not known")
 
 
