@@ -31,8 +31,7 @@ from cadence.errors import InputError
 from cadence.metrics import Interval
 from cadence.network.scene import SceneNetwork
 from cadence.recordings import Recordings
-from cadence.training.loop import OptimiserConfig
-from cadence.training.place import untrained_network
+from cadence.training.loop import OptimiserConfig, untrained
 from cadence.worlds.prison_map import SIDE, prison_map
 from pipeline.checkpoints import checkpoint_hash, read_info
 from pipeline.episodes.pool import EpisodePool, EpisodeSource
@@ -168,7 +167,7 @@ def train_config(variant: Variant, setup: Setup, seed: int) -> TrainConfig:
 
 def build(variant: Variant, seed: int) -> SceneNetwork:
     """The untrained network; the true map is fixed in it."""
-    network = untrained_network(variant.model, seed)
+    network = untrained(variant.model.build, seed)
     if variant.true_map:
         with torch.no_grad():
             network.map.copy_(coverage_cells())

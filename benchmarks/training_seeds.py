@@ -28,7 +28,7 @@ from benchmarks.table1 import EVALUATION_SEED
 from benchmarks.table1_page import LATE, NAMES, measure_rows, worst
 from cadence.errors import CadenceError
 from cadence.recordings import Recordings
-from cadence.training.place import untrained_network
+from cadence.training.loop import untrained
 from pipeline.checkpoints import checkpoint_hash, read_info, windows_seen
 from pipeline.config import stage_config
 from pipeline.episodes.pool import EpisodePool, EpisodeSource
@@ -128,7 +128,7 @@ def train(method: str, world: World, seed: int, setup: Setup, episodes: tuple[Re
     if method != "cadence":
         train_rival(out, config, *episodes, setup.progress)
         return
-    network = untrained_network(config.scene.model, seed)
+    network = untrained(config.scene.model.build, seed)
     pools = [EpisodePool((part,), (1.0,)) for part in episodes]
     train_scene_network(out, config, network, *pools, setup.progress)
 

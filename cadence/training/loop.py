@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -11,6 +12,8 @@ from cadence.training.ema import Ema
 
 Loss = Callable[[nn.Module], Tensor]
 """A batch and its random numbers, closed over: network -> scalar loss."""
+
+N = TypeVar("N", bound=nn.Module)
 
 
 @dataclass(frozen=True)
@@ -33,6 +36,13 @@ class OptimiserConfig:
     ema_decay: float = 0.999
     max_gradient_norm: float = 1.0
     bf16: bool = False
+
+
+def untrained(build: Callable[[], N], seed: int) -> N:
+    """The network that `build` makes, with the first weights that belong to a seed."""
+    with torch.random.fork_rng(devices=[]):  # layers take their first weights from the global stream, which is left as it was
+        torch.random.manual_seed(seed)
+        return build()
 
 
 class Trainer:

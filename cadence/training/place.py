@@ -12,7 +12,7 @@ from cadence.diffusion.scene import SceneModel, SceneSampling
 from cadence.diffusion.scene_frame import SceneConfig
 from cadence.network.scene import SceneNetwork, SceneNetworkConfig
 from cadence.recordings import Recordings
-from cadence.training.loop import OptimiserConfig, Trainer
+from cadence.training.loop import OptimiserConfig, Trainer, untrained
 from cadence.training.scene import Dropout, diffusion_loss, scene_windows
 
 _ROOM = 1.05
@@ -63,7 +63,7 @@ def train_place(
         on_step: is called with the number of each step and its loss.
     """
     config = config or place_config(recordings)
-    trainer = Trainer(untrained_network(config, seed), optimiser or OptimiserConfig())
+    trainer = Trainer(untrained(config.build, seed), optimiser or OptimiserConfig())
     for step in range(trainer.config.num_steps):
         rng = np.random.default_rng([seed, step])
         rows = rng.integers(0, len(recordings.position_m), batch_size)
@@ -80,10 +80,3 @@ def train_place(
     learned = trainer.ema.network
     assert isinstance(learned, SceneNetwork)
     return SceneModel(learned.eval(), config, SceneSampling())
-
-
-def untrained_network(config: SceneConfig, seed: int) -> SceneNetwork:
-    """The network of a configuration with the first weights that belong to a seed."""
-    with torch.random.fork_rng(devices=[]):  # layers take their first weights from the global stream, which is left as it was
-        torch.random.manual_seed(seed)
-        return config.build()

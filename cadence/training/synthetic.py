@@ -49,7 +49,7 @@ class ResidualWindows:
     def __len__(self) -> int:
         return len(self.residual)
 
-    def __getitem__(self, rows: Tensor) -> "ResidualWindows":
+    def __getitem__(self, rows: slice | Tensor) -> "ResidualWindows":
         """A selection of windows."""
         return ResidualWindows(self.context[rows], self.residual[rows], self.sample[rows])
 

@@ -1,28 +1,28 @@
 """Training of the general preset: windows of synthetic kinematics made on the fly, or of logs with truth."""
 
-import functools
 from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 import torch
-from torch import nn
 
 from cadence.errors import InputError
 from cadence.network.residual import ResidualNetwork
-from cadence.training.loop import Loss, Trainer
+from cadence.training.loop import Trainer, untrained
 from cadence.training.residual import residual_loss
 from cadence.training.synthetic import ResidualWindows, join_windows, residual_windows
 from pipeline.estimators.fitting import FittingData
 from pipeline.manifest import StageResult
 from pipeline.progress import Progress
 from pipeline.train.config import TrainConfig
+from pipeline.train.lessons import Lessons, in_parts
 from pipeline.train.missions import TrainingMission, missions_of_logs
 from pipeline.train.run import TrainingRun, run_training
 from pipeline.train.shards import synthetic_shard
 from pipeline.windows import GridConfig, build_windows, plan_grid, truth_on_grid
 
 _VALIDATION_SEED_OFFSET = 500_009
+_VALIDATION_BATCH = 256
 _VALIDATION_SHARE = 0.1
 _STEPS_A_SHARD = 120
 """New shards join at this pace, so that making them does not hold up the start."""
@@ -32,24 +32,11 @@ _MAX_GAP_STEPS = 4.0
 def train_general(out: Path, config: TrainConfig, progress: Progress, force: bool = False) -> StageResult:
     """Train the general preset into `out`; see `pipeline.train.stage.train`. `config.data` None means synthetic kinematics."""
     source: _Source = _LogSource(out, config, progress) if config.data is not None else _SyntheticSource(out, config)
-    with torch.random.fork_rng(devices=[]):  # layers take their first weights from the global stream, which is left as it was
-        torch.random.manual_seed(config.seed)
-        trainer = Trainer(ResidualNetwork(config.network), config.optimiser)
-
-    def loss_at(step: int) -> Loss:
-        generator = torch.Generator().manual_seed(config.seed * 7_919 + step)
-        windows = source.batch(step, config.batch_size, generator)
-        return functools.partial(residual_loss, windows=windows, generator=generator)
-
-    @torch.no_grad()
-    def validate(network: nn.Module) -> float:
-        generator = torch.Generator().manual_seed(1)
-        windows = source.validation
-        parts = [torch.arange(begin, min(begin + 256, len(windows))) for begin in range(0, len(windows), 256)]
-        return sum(float(residual_loss(network, windows[part], generator)) * len(part) for part in parts) / len(windows)
-
+    trainer = Trainer(untrained(lambda: ResidualNetwork(config.network), config.seed), config.optimiser)
+    parts = in_parts(source.validation, _VALIDATION_BATCH)
+    lessons = Lessons(source.batch, residual_loss, parts)
     run = TrainingRun(out, "general", config, config.network, config.optimiser.num_steps)
-    return run_training(run, trainer, loss_at, validate, progress, force)
+    return run_training(run, trainer, lessons, progress, force)
 
 
 class _Source(Protocol):
@@ -57,7 +44,7 @@ class _Source(Protocol):
 
     validation: ResidualWindows
 
-    def batch(self, step: int, size: int, generator: torch.Generator) -> ResidualWindows: ...
+    def batch(self, step: int, generator: torch.Generator) -> ResidualWindows: ...
 
 
 class _SyntheticSource:
@@ -70,14 +57,14 @@ class _SyntheticSource:
         numbers = range(config.num_validation_shards)
         self.validation = join_windows([synthetic_shard(self.folder, config.windows, seed, index) for index in numbers])
 
-    def batch(self, step: int, size: int, generator: torch.Generator) -> ResidualWindows:
+    def batch(self, step: int, generator: torch.Generator) -> ResidualWindows:
         num_open = min(self.config.num_shards, 2 + step // _STEPS_A_SHARD)
         parts = []
         for index in torch.randint(num_open, (2,), generator=generator).tolist():
             if index not in self.shards:
                 self.shards[index] = synthetic_shard(self.folder, self.config.windows, self.config.seed, index)
             shard = self.shards[index]
-            parts.append(shard[torch.randint(len(shard), (size // 2,), generator=generator)])
+            parts.append(shard[torch.randint(len(shard), (self.config.batch_size // 2,), generator=generator)])
         return join_windows(parts)
 
 
@@ -100,9 +87,10 @@ class _LogSource:
         num_validation = max(1, round(_VALIDATION_SHARE * len(usable)))
         held_out, kept = usable[:num_validation], usable[num_validation:]
         self.windows, self.validation = join_windows(kept), join_windows(held_out)
+        self.batch_size = config.batch_size
 
-    def batch(self, step: int, size: int, generator: torch.Generator) -> ResidualWindows:
-        return self.windows[torch.randint(len(self.windows), (size,), generator=generator)]
+    def batch(self, step: int, generator: torch.Generator) -> ResidualWindows:
+        return self.windows[torch.randint(len(self.windows), (self.batch_size,), generator=generator)]
 
 
 def mission_windows(mission: TrainingMission, config: TrainConfig, seed: int) -> ResidualWindows | None:

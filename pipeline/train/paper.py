@@ -17,18 +17,20 @@ from cadence.errors import ConfigError, InputError
 from cadence.network.trajectory import TrajectoryNetwork
 from cadence.recordings import Recordings, cut_windows
 from cadence.training.absolute import AbsoluteWindows, absolute_loss, forecast_rows, join_absolute
-from cadence.training.loop import Loss, Trainer
+from cadence.training.loop import Trainer, untrained
 from cadence.worlds.patrol import simulate_patrol
 from pipeline.arrays import Column, Float64s, Int64s
 from pipeline.episodes.pool import load_pool
 from pipeline.manifest import StageResult
 from pipeline.progress import Progress
 from pipeline.train.config import AbsoluteTraining, TrainConfig
+from pipeline.train.lessons import Lessons, in_parts
 from pipeline.train.missions import TrainingMission, mission_of_episode, missions_of_logs
 from pipeline.train.run import TrainingRun, run_training
 from pipeline.windows import Grid, MissionWindows, build_windows, truth_on_grid
 
 _VALIDATION_SEED_OFFSET = 500_009
+_VALIDATION_BATCH = 256
 _STEPS_AN_EPISODE = 10
 """A new simulated episode joins after this many steps, so that simulating does not hold up the start."""
 _FIRST_EPISODES = 8
@@ -42,29 +44,17 @@ def train_absolute(out: Path, config: TrainConfig, progress: Progress, force: bo
     From `config.paper.sources`, or else from the logs in `config.data`, or without these from the simulator.
     """
     source = _source(out, config, progress)
-    with torch.random.fork_rng(devices=[]):  # layers take their first weights from the global stream, which is left as it was
-        torch.random.manual_seed(config.seed)
-        trainer = Trainer(TrajectoryNetwork(config.paper.network), config.optimiser)
+    trainer = Trainer(untrained(lambda: TrajectoryNetwork(config.paper.network), config.seed), config.optimiser)
     schedule = config.paper.network.schedule()
 
-    def loss_at(step: int) -> Loss:
-        generator = torch.Generator().manual_seed(config.seed * 7_919 + step)
-        windows = source.batch(step, config.batch_size, generator)
-        return functools.partial(_loss, windows=windows, generator=generator)
-
-    def _loss(network: nn.Module, windows: AbsoluteWindows, generator: torch.Generator) -> Tensor:
+    def loss(network: nn.Module, windows: AbsoluteWindows, generator: torch.Generator) -> Tensor:
         assert isinstance(network, TrajectoryNetwork)
         return absolute_loss(network, windows, schedule, generator)
 
-    @torch.no_grad()
-    def validate(network: nn.Module) -> float:
-        generator = torch.Generator().manual_seed(1)
-        windows = source.validation
-        parts = [windows[begin : begin + 256] for begin in range(0, len(windows), 256)]
-        return sum(float(_loss(network, part, generator)) * len(part) for part in parts) / len(windows)
-
+    parts = in_parts(source.validation, _VALIDATION_BATCH)
+    lessons = Lessons(source.batch, loss, parts)
     run = TrainingRun(out, "paper", config, source.model, config.optimiser.num_steps)
-    return run_training(run, trainer, loss_at, validate, progress, force)
+    return run_training(run, trainer, lessons, progress, force)
 
 
 class _Source(Protocol):
@@ -73,7 +63,7 @@ class _Source(Protocol):
     model: AbsoluteConfig
     validation: AbsoluteWindows
 
-    def batch(self, step: int, size: int, generator: torch.Generator) -> AbsoluteWindows:
+    def batch(self, step: int, generator: torch.Generator) -> AbsoluteWindows:
         """The windows of a step, which depend on nothing but it and the generator."""
         ...
 
@@ -92,7 +82,7 @@ class _EpisodeSource:
     def __init__(self, cache: Path, config: TrainConfig, progress: Progress) -> None:
         paper = config.paper
         load = functools.partial(load_pool, cache=cache, step_s=paper.step_s, where="train.paper", progress=progress)
-        self.pool, self.paper, self.seed = load(paper.sources), paper, config.seed
+        self.pool, self.paper, self.seed, self.batch_size = load(paper.sources), paper, config.seed, config.batch_size
         if paper.validation:
             held_out = load(paper.validation)
         else:
@@ -102,9 +92,10 @@ class _EpisodeSource:
         windows = join_absolute([self._cut(part, rows) for part, rows in drawn])
         self.validation = self._hidden(windows, torch.Generator().manual_seed(config.seed))
 
-    def batch(self, step: int, size: int, generator: torch.Generator) -> AbsoluteWindows:
+    def batch(self, step: int, generator: torch.Generator) -> AbsoluteWindows:
         rng = np.random.default_rng([self.seed, step])
-        return self._hidden(join_absolute([self._cut(part, rows) for part, rows in self.pool.rows(size, rng)]), generator)
+        drawn = self.pool.rows(self.batch_size, rng)
+        return self._hidden(join_absolute([self._cut(part, rows) for part, rows in drawn]), generator)
 
     def _cut(self, part: Recordings, rows: Int64s) -> AbsoluteWindows:
         episode = np.searchsorted(part.offset, rows, side="right") - 1
@@ -135,14 +126,14 @@ class _LogSource:
         kept = [missions[index] for index in sorted(order[num_validation:])]
         held_out = [missions[index] for index in sorted(order[:num_validation])]
         places = [np.stack([mission.truth[name].to_numpy() for name in ("x_m", "y_m")]) for mission in kept]
-        self.model = paper.model_config(*_map_limits(paper, places))
+        self.model, self.batch_size = paper.model_config(*_map_limits(paper, places)), config.batch_size
         make = functools.partial(mission_windows, training=paper, model=self.model)
         self.windows = _joined([make(mission, seed=config.seed + i) for i, mission in enumerate(kept)], config.data)
         offset = config.seed + _VALIDATION_SEED_OFFSET
         self.validation = _joined([make(mission, seed=offset + i) for i, mission in enumerate(held_out)], config.data)
 
-    def batch(self, step: int, size: int, generator: torch.Generator) -> AbsoluteWindows:
-        return self.windows[torch.randint(len(self.windows), (size,), generator=generator)]
+    def batch(self, step: int, generator: torch.Generator) -> AbsoluteWindows:
+        return self.windows[torch.randint(len(self.windows), (self.batch_size,), generator=generator)]
 
 
 class _PatrolSource:
@@ -158,9 +149,9 @@ class _PatrolSource:
         if len(self.validation) == 0:
             raise ConfigError("train.paper.patrol: no window of the validation episodes has a detection; raise detection_rate")
 
-    def batch(self, step: int, size: int, generator: torch.Generator) -> AbsoluteWindows:
+    def batch(self, step: int, generator: torch.Generator) -> AbsoluteWindows:
         num = min(self.config.paper.num_episodes, _FIRST_EPISODES + step // _STEPS_AN_EPISODE)
-        pick = torch.randint(num, (size,), generator=generator)
+        pick = torch.randint(num, (self.config.batch_size,), generator=generator)
         counts = torch.bincount(pick, minlength=num).tolist()
         parts = []
         for index, count in enumerate(counts):
@@ -168,7 +159,7 @@ class _PatrolSource:
             if len(windows):
                 parts.append(windows[torch.randint(len(windows), (count,), generator=generator)])
         # episodes in which nothing was seen leave gaps; none at all is next to impossible
-        return join_absolute(parts or [self.validation[:size]])
+        return join_absolute(parts or [self.validation[: self.config.batch_size]])
 
     def _episode(self, index: int) -> AbsoluteWindows:
         if index not in self.episodes:

@@ -17,7 +17,7 @@ from cadence.baselines.mixture import HistoryConfig, MixtureFrame
 from cadence.baselines.vrnn import VrnnNetwork
 from cadence.errors import ConfigError
 from cadence.recordings import Recordings, cut_windows
-from cadence.training.loop import Loss, Trainer
+from cadence.training.loop import Trainer, untrained
 from cadence.training.mixtures import MixtureWindows, grammi_loss, hidden_goals, mixture_windows, vrnn_loss
 from pipeline.checkpoints import (
     CheckpointInfo,
@@ -33,11 +33,13 @@ from pipeline.estimators.mixtures import RIVALS, GrammiConfig, VrnnConfig, fresh
 from pipeline.manifest import StageResult
 from pipeline.progress import Progress
 from pipeline.train.config import RivalTraining, TrainConfig
+from pipeline.train.lessons import Lessons, in_parts
 from pipeline.train.run import OUTPUTS, TrainingRun, run_training
 
 _BATCHES_A_BLOCK = 32
 """Batches cut at once: cutting has a fixed cost that goes with the recordings."""
 _VALIDATION_STREAM = 500_009
+_VALIDATION_BATCH = 512
 _MARGIN = 1.02
 """Map limits taken from the recordings get this much room."""
 
@@ -94,25 +96,22 @@ def _train(
     history, horizons = description.network.history, description.network.horizons
     source = _Source(recordings, frame, history, horizons, config.seed, config.batch_size)
     checks = _cut(validation, frame, history, horizons, rival.num_validation_windows, [config.seed, _VALIDATION_STREAM])
-    with torch.random.fork_rng(devices=[]):  # layers take their first weights from the global stream, which is left as it was
-        torch.random.manual_seed(config.seed)
-        trainer = Trainer(_network(description, rival.start), optimiser)
+    checks = hidden_goals(checks, rival.hidden_goals, torch.Generator().manual_seed(1))
+    trainer = Trainer(untrained(lambda: _network(description, rival.start), config.seed), optimiser)
 
-    def loss_at(step: int) -> Loss:
-        generator = torch.Generator().manual_seed(config.seed * 7_919 + step)
-        windows = hidden_goals(source.batch(step), rival.hidden_goals, generator)
-        return functools.partial(_loss, windows=windows, rival=rival, generator=generator)
+    def batch(step: int, generator: torch.Generator) -> MixtureWindows:
+        return hidden_goals(source.batch(step), rival.hidden_goals, generator)
 
+    def loss(network: nn.Module, windows: MixtureWindows, generator: torch.Generator) -> Tensor:
+        if isinstance(network, VrnnNetwork):
+            return vrnn_loss(network, windows, generator, rival.kl_weight)
+        assert isinstance(network, GrammiNetwork)
+        return grammi_loss(network, windows, rival.mi_weight)
+
+    lessons = Lessons(batch, loss, in_parts(checks, _VALIDATION_BATCH), _negative_log_likelihood)
     run = TrainingRun(out, config.preset, config, description, optimiser.num_steps, rival.start)
     best = _Best(out, run.key, force)
-
-    @torch.no_grad()
-    def validate(network: nn.Module) -> float:
-        score = _validation_loss(network, checks, rival.hidden_goals)
-        best.offer(trainer.step, score, network)
-        return score
-
-    result = run_training(run, trainer, loss_at, validate, progress, force)
+    result = run_training(run, trainer, lessons, progress, force, best.offer)
     return best.ship(result, trainer.ema.network)
 
 
@@ -145,22 +144,10 @@ def _grows_into(before: VrnnConfig | GrammiConfig, description: VrnnConfig | Gra
     return before == description
 
 
-def _loss(network: nn.Module, windows: MixtureWindows, rival: RivalTraining, generator: torch.Generator) -> Tensor:
-    if isinstance(network, VrnnNetwork):
-        return vrnn_loss(network, windows, generator, rival.kl_weight)
-    assert isinstance(network, GrammiNetwork)
-    return grammi_loss(network, windows, rival.mi_weight)
-
-
-def _validation_loss(network: nn.Module, windows: MixtureWindows, share: float) -> float:
-    """Mean negative log likelihood over windows and horizons, latent variables at their mean, the goal known in some."""
-    generator = torch.Generator().manual_seed(1)
-    windows = hidden_goals(windows, share, generator)
-    total = 0.0
-    for pick in torch.split(torch.arange(len(windows)), 512):
-        part = windows[pick]
-        total += float(network(part.inputs).negative_log_likelihood(part.target).mean()) * len(part)
-    return total / len(windows)
+def _negative_log_likelihood(network: nn.Module, windows: MixtureWindows, _: torch.Generator) -> Tensor:
+    """Mean over windows and horizons, latent variables at their mean."""
+    mean: Tensor = network(windows.inputs).negative_log_likelihood(windows.target).mean()
+    return mean
 
 
 class _Source:

@@ -14,7 +14,7 @@ from safetensors.torch import load_file
 from torch import nn
 
 from cadence.errors import InputError
-from cadence.training.loop import Loss, Trainer
+from cadence.training.loop import Trainer
 from pipeline.checkpoints import (
     WEIGHTS_NAME,
     CheckpointInfo,
@@ -29,6 +29,7 @@ from pipeline.files import write_atomic
 from pipeline.manifest import StageResult
 from pipeline.progress import Progress
 from pipeline.train.config import TrainConfig
+from pipeline.train.lessons import Lessons, W
 
 Curve = list[tuple[int, float, float]]
 """(step, training loss, validation loss) of every validation."""
@@ -63,20 +64,20 @@ class TrainingRun:
 def run_training(
     run: TrainingRun,
     trainer: Trainer,
-    loss_at: Callable[[int], Loss],
-    validate: Callable[[nn.Module], float],
+    lessons: Lessons[W],
     progress: Progress,
     force: bool = False,
+    on_validation: Callable[[int, float, nn.Module], object] = lambda *_: None,
 ) -> StageResult:
     """Train to the last step, going on from a killed call's state unless `force`; the checkpoint holds the average weights.
 
     Args:
         run: of the training.
         trainer: fresh.
-        loss_at: the batch of a step, closed over; must depend on nothing but the step.
-        validate: the validation loss of a network.
+        lessons: what it is taught.
         progress: bar and notes.
         force: start anew.
+        on_validation: is told each step at which the network was examined, the loss and the average weights.
     """
     curve = [] if force else _resume(run, trainer)
     if trainer.step:
@@ -87,11 +88,12 @@ def run_training(
     with progress.bar(run.num_steps, "train", unit="step") as bar:
         bar.update(trainer.step)
         while trainer.step < run.num_steps:
-            recent.append(trainer.advance(loss_at(trainer.step)))
+            recent.append(trainer.advance(lessons.loss_at(trainer.step, run.config.seed)))
             bar.update(1)
             is_last = trainer.step == run.num_steps
             if trainer.step % run.config.validate_every == 0 or is_last:
-                curve.append((trainer.step, sum(recent) / len(recent), validate(trainer.ema.network)))
+                curve.append((trainer.step, sum(recent) / len(recent), lessons.validation_loss(trainer.ema.network)))
+                on_validation(trainer.step, curve[-1][2], trainer.ema.network)
                 recent = []
                 bar.set_postfix_str(f"loss {curve[-1][1]:.4f}, validation {curve[-1][2]:.4f}")
             if trainer.step % run.config.save_every == 0 or is_last:

@@ -10,14 +10,14 @@ from torch import nn
 from cadence.diffusion.scene_frame import SceneConfig
 from cadence.network.attention import Team
 from cadence.network.scene import Pieces, SceneInputs, SceneNetwork
-from cadence.training.loop import Loss, Trainer
-from cadence.training.place import untrained_network
+from cadence.training.loop import Trainer, untrained
 from cadence.training.scene import SceneWindows, diffusion_loss, energy_loss, scene_windows
 from pipeline.checkpoints import find_checkpoint, load_weights
 from pipeline.episodes.pool import EpisodePool, load_pool
 from pipeline.manifest import StageResult
 from pipeline.progress import Progress
 from pipeline.train.config import SceneTraining, TrainConfig
+from pipeline.train.lessons import Lessons
 from pipeline.train.run import TrainingRun, run_training
 
 _VALIDATION_BATCH = 250
@@ -32,7 +32,7 @@ def train_scene(out: Path, config: TrainConfig, progress: Progress, force: bool 
         load_pool(sources, cache, model.step_s, "train.scene.model", progress, together)
         for sources in (scene.sources, scene.validation)
     )
-    network = untrained_network(model, config.seed)
+    network = untrained(model.build, config.seed)
     if scene.start is not None:
         load_weights(find_checkpoint(scene.start), network)
     return train_scene_network(out, config, network, pool, held_out, progress, force)
@@ -51,40 +51,28 @@ def train_scene_network(
     scene = config.scene
     model = _model_config(scene)
 
-    def loss_at(step: int) -> Loss:
+    def batch(step: int, generator: torch.Generator) -> SceneWindows:
         rng = np.random.default_rng([config.seed, step])
         drawn = pool.rows(config.batch_size, rng)
-        windows = _joined([scene_windows(part, rows, model, scene.told, rng) for part, rows in drawn])
-        generator = torch.Generator().manual_seed(config.seed * 7_919 + step)
-        return lambda network: _loss(network, windows, scene, model, generator)
+        return _joined([scene_windows(part, rows, model, scene.told, rng) for part, rows in drawn])
+
+    def loss(network: nn.Module, windows: SceneWindows, generator: torch.Generator) -> torch.Tensor:
+        assert isinstance(network, SceneNetwork)
+        if scene.objective == "diffusion":
+            return diffusion_loss(network, windows, model, scene.path_weight, generator)
+        return energy_loss(network, windows, model, scene.num_samples, scene.score_weights, generator)
 
     rng = np.random.default_rng([config.seed, 1, 2])
     checks = held_out.rows_of_each(scene.num_validation_windows, rng)
     validation = _joined([scene_windows(part, rows, model, scene.told, rng) for part, rows in checks])
-
-    @torch.no_grad()
-    def validate(network: nn.Module) -> float:
-        generator = torch.Generator().manual_seed(1)
-        parts = validation.parts(_VALIDATION_BATCH)
-        total = sum(float(_loss(network, part, scene, model, generator)) * len(part) for part in parts)
-        return total / len(validation)
-
+    lessons = Lessons(batch, loss, list(validation.parts(_VALIDATION_BATCH)))
     start = None if scene.start is None else find_checkpoint(scene.start)
     run = TrainingRun(out, "scene", config, model, config.optimiser.num_steps, start)
-    return run_training(run, Trainer(network, config.optimiser), loss_at, validate, progress, force)
+    return run_training(run, Trainer(network, config.optimiser), lessons, progress, force)
 
 
 def _model_config(scene: SceneTraining) -> SceneConfig:
     return dataclasses.replace(scene.model, few_steps=scene.few_steps if scene.objective == "energy" else 0)
-
-
-def _loss(
-    network: nn.Module, windows: SceneWindows, scene: SceneTraining, model: SceneConfig, generator: torch.Generator
-) -> torch.Tensor:
-    assert isinstance(network, SceneNetwork)
-    if scene.objective == "diffusion":
-        return diffusion_loss(network, windows, model, scene.path_weight, generator)
-    return energy_loss(network, windows, model, scene.num_samples, scene.score_weights, generator)
 
 
 def _joined(parts: list[SceneWindows]) -> SceneWindows:
