@@ -258,12 +258,14 @@ class ChannelReader:
 
     def _covariance(self, matrix: Any, kind: Any, sigma_m: Any) -> Covariance:
         """What is unknown takes the stated accuracy, else the source's sigma_m; so does what is none, which is counted."""
-        if matrix is not None and kind != 0 and not (isinstance(kind, str) and "UNKNOWN" in kind):
+        if matrix is not None:
+            says_something = kind != 0 and not (isinstance(kind, str) and "UNKNOWN" in kind)
             try:
-                if (stated := stated_covariance(matrix)) is not None:
+                if (stated := stated_covariance(matrix)) is not None and says_something:
                     return stated
+                self.counts["disowned_covariance"] += stated is not None
             except (LookupError, TypeError, ValueError, OverflowError):
-                self.counts["bad_covariance"] += 1
+                self.counts["bad_covariance"] += says_something
         return stated_sigma(_number(sigma_m)) or self.unknown
 
     def _covariances(self, columns: Mapping[str, Column], num_rows: int) -> Float64s:
@@ -277,6 +279,7 @@ class ChannelReader:
         covariances, is_stated, is_bad = stated_covariances(columns["covariance"])
         says_something = columns["covariance_type"] != 0 if "covariance_type" in columns else np.ones(num_rows, np.bool_)
         self.counts["bad_covariance"] += int((is_bad & says_something).sum())
+        self.counts["disowned_covariance"] += int((is_stated & ~says_something).sum())
         return np.where((is_stated & says_something)[:, None], covariances, unknown)
 
     def _identity(self, kind: str, value: Any, place: Place) -> str | None:

@@ -29,6 +29,7 @@ from pipeline.extract.plausibility import Kind, Suspicions, few
 from pipeline.extract.positions import ChannelReader, Positions, Rows
 from pipeline.extract.reading import read_positions
 from pipeline.extract.reuse import without_reused_names
+from pipeline.extract.scatter import with_scatter
 from pipeline.extract.selection import ROLES, select_readers, selected_channels, unused_channels
 from pipeline.extract.spikes import is_spike
 from pipeline.extract.stages import without_other_stages
@@ -65,7 +66,8 @@ class ExtractConfig:
                      does not move, else the one that it moves in
     max_extrapolation_s   how long before its first and after its last sample a transform holds; later positions are refused
     max_transform_gap_s   longest time between two samples over which a transform is interpolated
-    default_sigma_m  standard deviation of detections that state none; without it they count as exact
+    default_sigma_m  standard deviation of detections that state none; without it that of their scatter about smooth ways, where
+                     there is one, else they count as exact
     max_speed_mps    single positions that could only be reached and left again faster are recorder faults (see `spikes`)
     trusted          kinds of suspicion that are not looked for: what the log says of them counts as it stands (docs/formats.md)
     is_strict        refuse a log of which something is suspected (`--strict`)
@@ -139,7 +141,8 @@ def write_tables(log: MissionLog, folder: Path, config: ExtractConfig, progress:
         counts = read_positions(log, readers, progress, *_cut_ns(log, config))
         rows, frame = _rows_in_frame(log, readers, config, counts, suspicions, transforms)
     counts["unselected_topics"] = len({c.topic for c in log.channels} - {c.topic for c in channels})
-    detections = collapse(_with_default_sigma(rows["detections"], config.default_sigma_m), config.simultaneity_s)
+    scattered, sigmas_m = _with_accuracy(rows["detections"], readers, config, suspicions)
+    detections = collapse(scattered, config.simultaneity_s)
     counts["disagreeing"] = detections.num_disagreeing
     _suspect_disagreement(detections, suspicions)
     counts["collapsed"] = len(rows["detections"]) - len(detections.positions) - detections.num_disagreeing
@@ -155,6 +158,11 @@ def write_tables(log: MissionLog, folder: Path, config: ExtractConfig, progress:
     write_obstacles(folder / OBSTACLES_NAME, obstacles)
     unused = unused_channels(readers, channels)
     tell(counts, suspicions, detections.positions, log, progress)
+    for topic, sigma_m in sigmas_m.items():
+        progress.note(
+            f"extract: {topic} states no accuracy, but its detections scatter by {sigma_m:.3g} m, which is taken as their "
+            "standard deviation; sigma_m in its [[extract.detections]] states another"
+        )
     for channel, why in unused.items():
         progress.note(f"extract: {channel} may hold detections and is not used: {why}")
     transforms.tell()
@@ -166,7 +174,7 @@ def write_tables(log: MissionLog, folder: Path, config: ExtractConfig, progress:
         refused = "; ".join(few(suspicions.lines()))
         raise ImplausibleInputError(f"{log.path}: refused by --strict, as something in it is suspected: {refused}")
     summary = summarise(log, readers, detections.positions, truth, poses, frame, counts, suspicions, len(obstacles))
-    return summary | {"unused": unused, "transforms": transforms.summary(counts)}
+    return summary | {"scatter_sigma_m": sigmas_m, "unused": unused, "transforms": transforms.summary(counts)}
 
 
 @contextlib.contextmanager
@@ -344,12 +352,19 @@ def _thinned(rows: Positions, config: ThinningConfig) -> Positions:
     return replace(rows, first=first, second=second, covariance_m2=covariance)[is_kept]
 
 
-def _with_default_sigma(rows: Positions, sigma_m: float | None) -> Positions:
-    if sigma_m is None:
-        return rows
+def _with_accuracy(
+    rows: Positions, readers: Sequence[ChannelReader], config: ExtractConfig, suspicions: Suspicions
+) -> tuple[Positions, dict[str, float]]:
+    """Detections with a covariance where they state none and the user or their scatter does; the latter's sigma by topic."""
+    found: dict[str, float] = {}
+    if not config.thinning.enabled:  # what is thinned is as exact as the truth, and its noise is stated
+        told = {reader.channel.topic for reader in readers if reader.source.sigma_m is not None}
+        rows, found = with_scatter(rows, told, config.default_sigma_m is not None, suspicions)
+    if config.default_sigma_m is None:
+        return rows, found
     covariance = rows.covariance_m2.copy()
-    covariance[np.isnan(covariance[:, 0])] = (sigma_m**2, 0.0, sigma_m**2)
-    return replace(rows, covariance_m2=covariance)
+    covariance[np.isnan(covariance[:, 0])] = config.default_sigma_m**2 * np.array([1.0, 0.0, 1.0])
+    return replace(rows, covariance_m2=covariance), found
 
 
 def _without_repeats(rows: Positions) -> tuple[Positions, int]:

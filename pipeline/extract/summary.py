@@ -26,6 +26,7 @@ def tell(counts: Counter[str], suspicions: Suspicions, detections: Positions, lo
         "no_fix": "positions are marked as having no fix, or as not valid, and were skipped",
         "unmet": "positions do not meet the conditions of `where` and were skipped",
         "bad_covariance": "covariances are not positive definite and were replaced by the default",
+        "disowned_covariance": "covariances are called unknown by their type and were not used (see a source's covariance)",
         "out_of_order": "time stamps were out of order and were sorted",
         "disagreeing": "simultaneous detections of an agent do not agree with the most accurate one, and were skipped",
         "spikes": "positions lie far off their track (see extract.max_speed_mps) and were skipped",
@@ -67,6 +68,7 @@ def summarise(
         "unmet",
         "dropped_nonfinite",
         "bad_covariance",
+        "disowned_covariance",
         "out_of_order",
         "outside_time_cut",
     )

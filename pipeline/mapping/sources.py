@@ -58,7 +58,7 @@ class SourceConfig:
     where       conditions on fields of the message, all of which must hold: "fix_type >= 3 && lat_lon_valid"; the preset's are
                 used where nothing is stated, and "" means none
     covariance  message path of 1, 4, 9 or 36 numbers (a variance, or rows of a matrix), 6 or 21 (an upper triangle) or 3 (a
-                diagonal), x first, m²
+                diagonal), x first, m²; where it is stated, what a preset reads of its type does not count
     sigma       message path of a standard deviation of x and y, in metres, where the message states no covariance
     sigma_m     standard deviation of x and y where the message states neither
     score       message path of a confidence
@@ -153,6 +153,8 @@ def resolve_paths(source: SourceConfig, schema_name: str) -> Preset:
         value = getattr(source, PATH_KEYS.get(item.name, item.name), None)
         if value is not None:
             stated[item.name] = (source.without_topic(value),) if item.name in PATHS else value
+    if source.covariance is not None:
+        stated["covariance_type"] = ()
     if source.where is not None:
         stated["where"] = (source.where,) if source.where else ()
     return replace(base, **stated)

@@ -26,6 +26,7 @@ LEFT_OUT = {
     "unmet": "positions that do not meet the conditions of where",
     "dropped_nonfinite": "positions that are NaN, infinite or off the earth",
     "bad_covariance": "covariances that were replaced by the default",
+    "disowned_covariance": "covariances that are called unknown by their type, not used",
     "out_of_order": "time stamps out of order, sorted",
     "outside_time_cut": "positions outside the chosen time span",
     "other_frame": "positions in another frame, left out",
@@ -57,10 +58,14 @@ def _extraction(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
     rows = [(text(words), text(count)) for words, count in counted.items() if count]
     if counted and not rows:
         rows = [("left out", "nothing")]
+    scatter = summary.get("scatter_sigma_m") or {}
+    rows += [
+        ("accuracy, by the scatter of the detections", text(f"{topic}: {sigma:.3g} m")) for topic, sigma in scatter.items()
+    ]
     unused = summary.get("unused") or {}
     rows += [("may hold detections, not used", text(f"{channel}: {why}")) for channel, why in unused.items()]
     # Other parts of the page tell of these already.
-    known = {*LEFT_OUT, "lost_spans_ns", "is_complete", "frame", "suspicions", "unused"}
+    known = {*LEFT_OUT, "lost_spans_ns", "is_complete", "frame", "suspicions", "unused", "scatter_sigma_m"}
     return [(label(key), text(value)) for key, value in flatten(summary)[:MAX_ENTRIES] if key.split(".")[0] not in known] + rows
 
 

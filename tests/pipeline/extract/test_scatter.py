@@ -1,0 +1,165 @@
+"""The accuracy of detections that state none, by their scatter; and statements that the scatter contradicts."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fixtures.small_logs import Row, detection, fix
+from test_extract import run
+
+from pipeline.extract.scatter import scatter_of
+
+SECONDS = np.arange(120.0)
+STRAIGHT = np.column_stack([5.0 * SECONDS, 0.0 * SECONDS])
+CIRCLE = 200.0 * np.column_stack([np.cos(SECONDS / 20.0), np.sin(SECONDS / 20.0)])
+
+
+def noise(sigma_m: float, num: int = 120, seed: int = 3) -> np.ndarray:
+    return np.random.default_rng(seed).normal(0.0, sigma_m, (num, 2))
+
+
+def several(num_targets: int, apart_m: float, sigma_m: float) -> np.ndarray:
+    """Each second one of several targets that go side by side, at random."""
+    who = np.random.default_rng(8).integers(0, num_targets, 120)
+    places = apart_m * np.array([[0, 0], [0, 1], [1, 0], [1, 1], [2, 0]])
+    return STRAIGHT + places[who] + noise(sigma_m)
+
+
+@pytest.mark.parametrize("way", [STRAIGHT, CIRCLE, 0.0 * STRAIGHT])
+@pytest.mark.parametrize("sigma_m", [2.0, 10.0])
+@pytest.mark.parametrize("is_one", [True, False])
+def test_white_noise(way: np.ndarray, sigma_m: float, is_one: bool) -> None:
+    found = scatter_of(SECONDS, way + noise(sigma_m), is_one)
+    assert found is not None and found.is_noise and found.sigma_m == pytest.approx(sigma_m, rel=0.2)
+
+
+def test_white_noise_at_irregular_times() -> None:
+    time_s = np.sort(np.random.default_rng(5).uniform(0.0, 120.0, 120))
+    found = scatter_of(time_s, np.column_stack([5.0 * time_s, 0.0 * time_s]) + noise(3.0), True)
+    assert found is not None and found.is_noise and found.sigma_m == pytest.approx(3.0, rel=0.25)
+
+
+@pytest.mark.parametrize(
+    "position_m",
+    [
+        STRAIGHT,
+        CIRCLE,
+        np.cumsum(noise(3.0), axis=0),  # a random walk
+        np.round(CIRCLE),  # rounded to a metre
+        np.column_stack([5.0 * SECONDS, 20.0 * np.sin(SECONDS / 2.0)]),  # turns sharply
+        np.tile([3.0, 4.0], (120, 1)),
+    ],
+)
+def test_ways_without_noise(position_m: np.ndarray) -> None:
+    found = scatter_of(SECONDS, position_m, True)
+    assert found is not None and not found.is_noise
+
+
+def test_turns_that_are_seen_too_rarely() -> None:
+    """An aircraft on circles of two minutes, reported every three on average: kilometres of scatter, and no noise."""
+    time_s = np.cumsum(np.random.default_rng(2).uniform(60.0, 300.0, 120))
+    circles = 1500.0 * np.column_stack([np.cos(time_s / 19.0), np.sin(time_s / 19.0)])
+    found = scatter_of(time_s, circles, True)
+    assert found is None or not found.is_noise
+
+
+@pytest.mark.parametrize(
+    ("num", "apart_m", "sigma_m"), [(2, 10.0, 2.0), (2, 50.0, 0.0), (2, 100.0, 2.0), (4, 30.0, 2.0), (5, 100.0, 2.0)]
+)
+def test_several_targets_are_not_one_noisy_one(num: int, apart_m: float, sigma_m: float) -> None:
+    assert scatter_of(SECONDS, several(num, apart_m, sigma_m), False) is None
+
+
+def test_two_targets_in_turn() -> None:
+    position_m = STRAIGHT + np.column_stack([0.0 * SECONDS, 30.0 * (SECONDS % 2)])
+    assert scatter_of(SECONDS, position_m, False) is None
+
+
+@pytest.mark.parametrize("num", [0, 1, 5, 27])
+def test_too_few_rows(num: int) -> None:
+    assert scatter_of(SECONDS[:num], (STRAIGHT + noise(2.0))[:num], True) is None
+
+
+def rows(position_m: np.ndarray, agent: str | None = "a", covariance_m2: float | None = None) -> list[Row]:
+    more = {} if agent is None else {"agent_id": agent}
+    more |= {} if covariance_m2 is None else {"covariance": [covariance_m2, 0.0, 0.0, covariance_m2]}
+    return [detection(float(i), *place, **more) for i, place in enumerate(position_m.tolist())]
+
+
+@pytest.mark.parametrize("agent", ["a", None])
+@pytest.mark.parametrize("stated", [None, 0.0, -1.0, float("nan"), 1e308])
+def test_unknown_accuracy_is_that_of_the_scatter(tmp_path: Path, agent: str | None, stated: float | None) -> None:
+    found = run(tmp_path, rows(STRAIGHT + noise(2.0), agent, stated))
+    assert (
+        found.summary["scatter_sigma_m"] == {"/detections": pytest.approx(2.0, rel=0.2)} and found.summary["suspicions"] == []
+    )
+    sigma_m = found.summary["scatter_sigma_m"]["/detections"]
+    assert found.detections["cov_xx_m2"].to_pylist() == pytest.approx([sigma_m**2] * 120)
+
+
+def test_without_scatter_they_stay_exact(tmp_path: Path) -> None:
+    found = run(tmp_path, rows(CIRCLE))
+    assert found.summary["scatter_sigma_m"] == {} and found.detections["cov_xx_m2"].null_count == 120
+
+
+@pytest.mark.parametrize(
+    "told",
+    [
+        {"default_sigma_m": 7.0},
+        {"detections": [{"topic": "/detections", "agent_path": "agent_id", "sigma_m": 7.0}]},
+    ],
+)
+def test_what_the_user_states_counts(tmp_path: Path, told: dict[str, object]) -> None:
+    found = run(tmp_path, rows(STRAIGHT + noise(2.0)), **told)
+    assert set(found.detections["cov_xx_m2"].to_pylist()) == {49.0} and found.summary["scatter_sigma_m"] == {}
+
+
+@pytest.mark.parametrize(
+    ("way", "stated_m2", "taken"),
+    [
+        (lambda: STRAIGHT, 1e6, "taken as not stated"),  # a driver's "I do not know"
+        (lambda: STRAIGHT + noise(5.0), 1e-4, r" m are taken"),  # as sure as it is wrong
+    ],
+)
+def test_statements_that_cannot_be_meant(tmp_path: Path, way: Callable[[], np.ndarray], stated_m2: float, taken: str) -> None:
+    found = run(tmp_path, rows(way(), "a", stated_m2))
+    (suspicion,) = found.summary["suspicions"]
+    assert suspicion["kind"] == "covariance" and suspicion["done"].endswith(taken)
+    trusted = run(tmp_path, rows(way(), "a", stated_m2), trusted=["covariance"])
+    assert trusted.summary["suspicions"] == [] and set(trusted.detections["cov_xx_m2"].to_pylist()) == {stated_m2}
+
+
+@pytest.mark.parametrize(("sigma_m", "stated_m"), [(2.0, 2.0), (2.0, 0.5), (0.0, 15.0), (0.05, 3.0), (30.0, 500.0)])
+def test_statements_that_can_be_meant(tmp_path: Path, sigma_m: float, stated_m: float) -> None:
+    """A receiver smooths: its positions scatter by centimetres and are off by metres."""
+    found = run(tmp_path, rows(STRAIGHT + noise(sigma_m), "a", stated_m**2))
+    assert found.summary["suspicions"] == [] and set(found.detections["cov_xx_m2"].to_pylist()) == {stated_m**2}
+
+
+def test_a_covariance_that_its_type_disowns(tmp_path: Path) -> None:
+    matrix = np.diag([100.0, 100.0, 400.0]).ravel().tolist()
+    metres = (CIRCLE + noise(10.0)) / 111_000.0
+    log = [
+        fix(float(i), 48.1 + y, 11.6 + x / 0.668, position_covariance=matrix, position_covariance_type=0)
+        for i, (x, y) in enumerate(metres.tolist())
+    ]
+    found = run(tmp_path, log)
+    assert found.summary["disowned_covariance"] == 120
+    assert found.summary["scatter_sigma_m"]["/contacts/A"] == pytest.approx(10.0, rel=0.2)
+    told = run(tmp_path, log, detections=[{"topic": "/contacts/{agent}", "covariance": "position_covariance"}])
+    assert set(told.detections["cov_xx_m2"].to_pylist()) == {100.0} and told.summary["disowned_covariance"] == 0
+
+
+def test_one_agents_numbers_do_not_touch_anothers(tmp_path: Path) -> None:
+    log = [
+        detection(float(i), *place, topic=f"/contacts/{name}", covariance=[value, 0.0, 0.0, value])
+        for i, place in enumerate((STRAIGHT + noise(2.0)).tolist())
+        for name, value in (("a", 1e308), ("b", -1.0), ("c", float("nan")), ("d", 4.0))
+    ]
+    found = run(tmp_path, log)
+    assert set(found.summary["scatter_sigma_m"]) == {"/contacts/a", "/contacts/b", "/contacts/c"}
+    sound = [row for row in log if row.topic == "/contacts/d"]
+    alone = run(tmp_path, sound).detections.drop(["sequence"])
+    of_all = found.detections.drop(["sequence"]).filter([name == "d" for name in found.detections["agent_id"].to_pylist()])
+    assert of_all.to_pydict() == alone.to_pydict()
