@@ -12,6 +12,8 @@ import zstandard
 
 ZSTD_MAGIC: Final = b"\x28\xb5\x2f\xfd"
 """How a zstd frame begins that is not to be skipped."""
+MAX_MESSAGE_BYTES: Final = 2**26
+"""Largest message that is unpacked by itself."""
 
 
 def unpack_zstd(data: bytes | memoryview, max_bytes: int, is_cut: bool = False) -> bytes:
@@ -22,6 +24,15 @@ def unpack_zstd(data: bytes | memoryview, max_bytes: int, is_cut: bool = False) 
     if not is_cut and zstandard.frame_content_size(data) == max_bytes:  # what recorders write, in the fastest way
         return zstandard.ZstdDecompressor().decompress(data, max_output_size=max_bytes)
     return zstandard.ZstdDecompressor().stream_reader(BytesIO(data), read_across_frames=True).read(max_bytes + 1)
+
+
+def unpack_message(data: bytes) -> bytes:
+    """A message that is compressed by itself, as one zstd frame; ValueError where it is larger than the limit."""
+    declared = zstandard.frame_content_size(data)
+    unpacked = unpack_zstd(data, declared if 0 <= declared < MAX_MESSAGE_BYTES else MAX_MESSAGE_BYTES)
+    if len(unpacked) > MAX_MESSAGE_BYTES:
+        raise ValueError(f"it is compressed and larger than the limit of {MAX_MESSAGE_BYTES} bytes")
+    return unpacked
 
 
 def unpack_lz4(data: bytes | memoryview, max_bytes: int) -> bytes:

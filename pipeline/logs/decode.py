@@ -5,31 +5,34 @@ arrays for repeated fields. `field` reads both kinds.
 """
 
 import functools
-import itertools
 import json
 import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any, Final
 
 from mcap.records import Schema
 from mcap_protobuf.decoder import DecoderFactory as ProtobufDecoderFactory
 from mcap_ros2.decoder import DecoderFactory as Ros2DecoderFactory
+from rosbags.interfaces import Nodetype
 from rosbags.interfaces.typing import Typesdict
-from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from cadence.errors import InputError
+from pipeline.logs.compression import ZSTD_MAGIC, unpack_message
 from pipeline.logs.flatbuffer import flatbuffer_decoder
+from pipeline.logs.idl import types_from_idl
 from pipeline.logs.reader import Channel
 
 Decoder = Callable[[bytes], Any]
 
 _IDENTIFIER: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")
-_TEXT = r'"(?:[^"\\]|\\.)*"'
-_COMMENT_OR_TEXT: Final = re.compile(rf"{_TEXT}|/\*.*?\*/|//[^\n]*", re.DOTALL)
-_ANNOTATION: Final = re.compile(rf'@\w+\s*\((?:[^()"]|{_TEXT})*\)')
 _PLAIN_CDR: Final = (b"\x00\x00", b"\x00\x01")
+_CDR_OCTETS: Final = {"byte": "uint8", "char": "uint8", "wchar": "uint16"}
+"""Types of ROS 2 that are unsigned integers on the wire. (In ROS 1 a byte is signed, and a char is not.)"""
+_CHAR_FIELD: Final = re.compile(r"^([ \t]*)char\b", re.MULTILINE)
 _MAX_REASON = 160
 _MAX_STORES: Final = 64
 _STAMPS: Final = {
@@ -60,7 +63,7 @@ def decoder_for(channel: Channel) -> Decoder:
         elif encoding == "protobuf":
             decode = _protobuf_decoder(channel)
         elif encoding == "cdr":
-            decode = _cdr_decoder(channel)
+            decode = _unpacking(_cdr_decoder(channel))
         elif encoding == "ros1":
             decode = _ros1_decoder(channel)
         elif encoding == "flatbuffer":
@@ -124,10 +127,12 @@ def _protobuf_decoder(channel: Channel) -> Decoder:
 
 
 def _cdr_decoder(channel: Channel) -> Decoder:
-    """By rosbags, twice as fast as mcap_ros2; that one reads some schemas which rosbags refuses."""
+    """By rosbags, twice as fast as mcap_ros2; that one reads some definitions in ros2msg which rosbags refuses."""
     try:
         return _rosbags_cdr_decoder(channel)
     except Exception:  # the other one says what is wrong where it cannot either
+        if channel.schema_encoding != "ros2msg":
+            raise
         decode = _mcap_ros2_decoder(channel)
 
     def decode_plain(data: bytes) -> Any:
@@ -137,6 +142,11 @@ def _cdr_decoder(channel: Channel) -> Decoder:
         return decode(data)
 
     return decode_plain
+
+
+def _unpacking(decode: Decoder) -> Decoder:
+    """A decoder that also takes messages which rosbag2 has compressed one by one: no CDR begins as their frames do."""
+    return lambda data: decode(unpack_message(data) if data.startswith(ZSTD_MAGIC) else data)
 
 
 def cdr_types(channel: Channel) -> tuple[Typestore, str]:
@@ -158,12 +168,12 @@ def _cdr_types(schema_name: str, schema_encoding: str, schema_data: bytes) -> tu
     """A schema takes longer to read than a thousand messages, and is asked for more than once."""
     text = schema_data.decode("utf-8")
     if schema_encoding == "ros2idl":
-        types = get_types_from_idl(_plain_idl(text))
+        types = types_from_idl(text)
     elif schema_encoding == "ros2msg":
         types = get_types_from_msg(text, schema_name)
     else:
         raise ValueError(f"schema encoding {schema_encoding!r} is not known for CDR")
-    store = _store(types, Stores.EMPTY)
+    store = _store(_with_octets(types), Stores.EMPTY)
     return store, _type_name(store, schema_name)
 
 
@@ -174,10 +184,26 @@ def _ros1_decoder(channel: Channel) -> Decoder:
 
 
 def _mcap_ros2_decoder(channel: Channel) -> Decoder:
-    decode: Decoder | None = Ros2DecoderFactory().decoder_for("cdr", _schema(channel))
+    text = _CHAR_FIELD.sub(r"\1uint8", channel.schema_data.decode("utf-8"))  # a char would be signed
+    decode: Decoder | None = Ros2DecoderFactory().decoder_for("cdr", replace(_schema(channel), data=text.encode()))
     if decode is None:
-        raise ValueError(f"schema encoding {channel.schema_encoding!r} is not known for CDR")
+        raise ValueError("no decoder for it")
     return decode
+
+
+def _with_octets(types: Typesdict) -> Typesdict:
+    """The types with integers for what is an octet or a wide character; rosbags takes a byte for signed."""
+
+    def plain(described: Any) -> Any:
+        kind, detail = described
+        if kind == Nodetype.BASE:
+            return kind, (_CDR_OCTETS.get(detail[0], detail[0]), detail[1])
+        return described if kind == Nodetype.NAME else (kind, (plain(detail[0]), detail[1]))
+
+    return {
+        name: (constants, [(member, plain(described)) for member, described in members])
+        for name, (constants, members) in types.items()
+    }
 
 
 def _store(types: Typesdict, base: Stores) -> Typestore:
@@ -200,18 +226,9 @@ def _type_name(store: Typestore, schema_name: str) -> str:
     parts = schema_name.replace("::", "/").split("/")
     for name in ("/".join(parts), f"{parts[0]}/msg/{parts[-1]}"):
         if name in store.fielddefs:
-            store.get_msgdef(name)  # now, so that a type that cannot be compiled makes the channel undecodable
+            try:
+                store.get_msgdef(name)  # now, so that a type that cannot be compiled makes the channel undecodable
+            except KeyError as error:
+                raise ValueError(f"the schema does not define {error.args[0]}") from error
             return name
     raise ValueError(f"the schema does not define {schema_name}")
-
-
-def _plain_idl(text: str) -> str:
-    """IDL of several files in one schema, with the definitions alone.
-
-    Between the files stand === and IDL: name, in them #include. Comments and annotations with arguments (@verbatim, which
-    holds comments, and @default, @range, @unit) say nothing about the bytes and cost the parser most of its time.
-    """
-    is_definition = (not line.startswith(("IDL: ", "#")) and set(line) != {"="} for line in text.splitlines())
-    definitions = "\n".join(itertools.compress(text.splitlines(), is_definition))
-    uncommented = _COMMENT_OR_TEXT.sub(lambda found: found[0] if found[0].startswith('"') else " ", definitions)
-    return _ANNOTATION.sub(" ", uncommented)

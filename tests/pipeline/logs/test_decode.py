@@ -10,6 +10,7 @@ import flatbuffers
 import foxglove_schemas_flatbuffer
 import numpy as np
 import pytest
+import zstandard
 from foxglove_schemas_flatbuffer import (
     CubePrimitive,
     LocationFix,
@@ -123,6 +124,18 @@ def test_cdr_by_msg_and_by_idl_in_both_byte_orders(name, encoding, text, little_
     decode = decoder_for(channel("cdr", name, encoding, text))
     point = decode(cdr(struct.pack("<2d" if little_endian else ">2d", 1.5, -2.0), little_endian))
     assert (field(point, "x"), field(point, "y")) == (1.5, -2.0)
+
+
+@pytest.mark.parametrize("little_endian", [True, False])
+def test_messages_that_are_compressed_one_by_one_are_unpacked(little_endian):
+    """As rosbag2 writes them with the compression mode MESSAGE; the schema says nothing about it."""
+    decode = decoder_for(channel("cdr", "a/msg/Point", "ros2msg", "float64 x\nfloat64 y\n"))
+    plain = cdr(struct.pack("<2d" if little_endian else ">2d", 1.5, -2.0), little_endian)
+    unsized = zstandard.ZstdCompressor(write_content_size=False)
+    assert decode(zstandard.compress(plain)) == decode(unsized.compress(plain)) == decode(plain)
+    for damaged in (zstandard.compress(plain)[:-3], zstandard.compress(bytes(2**26 + 1)), zstandard.compress(b"")):
+        with pytest.raises(UndecodableMessage):
+            decode(damaged)
 
 
 def test_idl_of_several_files_decodes():
