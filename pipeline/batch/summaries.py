@@ -10,6 +10,7 @@ from cadence.errors import ImplausibleInputError, PartialInputError
 from pipeline.batch.outcome import LogOutcome, Status
 from pipeline.extract.plausibility import few, suspicions_in
 from pipeline.manifest import StageResult
+from pipeline.score_words import METRICS, estimator_words, value_words
 from pipeline.stores.urls import shown
 
 SHOWN_STAGES = ("export", "report")
@@ -40,6 +41,7 @@ def stage_summary(result: StageResult) -> str:
     """What was done in one line, its counts and numbers in the next, then the files."""
     numbers = [_named(name, value) for name, value in result.summary.items() if type(value) in (int, float) and value]
     lines = [f"{result.stage}: {result.status}", *([f"  {', '.join(numbers)}"] if numbers else [])]
+    lines += [f"  {line}" for line in result.summary.get("verdict", ())]
     lines += score_lines(result.summary.get("scores", ()))
     lines += [f"  suspected {line}" for line in few(suspicions_in(result.summary))]
     return "\n".join(lines + [f"  {path}" for path in result.outputs])
@@ -56,10 +58,12 @@ def score_lines(scores: Sequence[Mapping[str, Any]]) -> list[str]:
     """The headline of `cadence evaluate` as a table: a row an estimator, a column a part and metric."""
     columns = list(dict.fromkeys((str(score["part"]), str(score["metric"])) for score in scores))
     values = {(score["estimator"], score["part"], score["metric"]): score["value"] for score in scores}
-    rows = [["", *(f"{part} {metric}" for part, metric in columns)]]
+    parts = [part if index == 0 or part != columns[index - 1][0] else "" for index, (part, _) in enumerate(columns)]
+    rows = [["", *(f"{part}:" if part else "" for part in parts)]]
+    rows += [["", *(METRICS.get(metric, metric.replace("_", " ")) for _, metric in columns)]]
     for estimator in dict.fromkeys(score["estimator"] for score in scores):
-        cells = [values.get((estimator, *column)) for column in columns]
-        rows.append([str(estimator), *("-" if cell is None else f"{cell:.4g}" for cell in cells)])
+        cells = [value_words(metric, values.get((estimator, part, metric))) for part, metric in columns]
+        rows.append([estimator_words(str(estimator)), *cells])
     widths = [max(len(row[i]) for row in rows) for i in range(len(columns) + 1)]
     return ["  " + "  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in rows if scores]
 

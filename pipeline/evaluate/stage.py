@@ -27,7 +27,7 @@ from pipeline.evaluate.matching import match_to_truth, matched_windows
 from pipeline.evaluate.motion import MotionLaws, true_motion
 from pipeline.evaluate.rivals import RIVALS
 from pipeline.evaluate.scores import Cells, Draw, IsInside, score_in_chunks
-from pipeline.evaluate.tables import OWN_NAME, ScoredMission, as_csv, as_json, as_markdown, headline, pool
+from pipeline.evaluate.tables import OWN_NAME, ScoredMission, as_csv, as_json, as_markdown, headline, pool, verdict
 from pipeline.files import write_atomic
 from pipeline.forecast.stage import ForecastConfig, evaluate_forecasts
 from pipeline.manifest import StageResult, check_chain, manifest_path, read_manifest, run_stage
@@ -395,4 +395,4 @@ def _write_scores(missions: Sequence[ScoredMission], folder: Path, config: Evalu
     write_atomic(folder / "scores.json", as_json(report))
     write_atomic(folder / "scores.csv", as_csv(report))
     write_atomic(folder / "scores.md", as_markdown(report))
-    return {"num_logs": len(missions), "grouped_by": report.grouped_by, "scores": headline(report)}
+    return {"num_logs": len(missions), "grouped_by": report.grouped_by, "verdict": verdict(report), "scores": headline(report)}

@@ -14,6 +14,7 @@ from pipeline.evaluate.joint import JOINT_METRICS, JointCells, block_of, summari
 from pipeline.evaluate.motion import MotionLaws, MotionSample, motion_rows
 from pipeline.evaluate.scores import PARTS, Cells, ScoreRow, energy_ratio, groups_of, summarise
 from pipeline.plain_rows import rows_as_csv, without_nan
+from pipeline.score_words import estimator_words
 
 OWN_NAME = "cadence"
 """The estimator whose hypotheses a mission directory holds, in every table."""
@@ -178,7 +179,7 @@ def as_csv(report: ScoreReport) -> str:
 
 def as_markdown(report: ScoreReport) -> str:
     """scores.md: what a person reads first."""
-    lines = ["# Scores", "", *_preface(report)]
+    lines = ["# Scores", "", *(f"* {line}" for line in verdict(report)), "", *_preface(report)]
     for part in PARTS:
         lines += _part_table(report, part)
     lines += _motion_table(report)
@@ -187,6 +188,28 @@ def as_markdown(report: ScoreReport) -> str:
     for (part, by), title in _SLICE_TITLES.items():
         lines += _slice_table(report, part, by, title)
     return "\n".join(lines).rstrip() + "\n"
+
+
+def verdict(report: ScoreReport) -> list[str]:
+    """A sentence each on the past and the future: against the best rival, and whether the 90 % region can be believed."""
+    return [" ".join([f"{part.capitalize()}:", *found]) for part in ("past", "future") if (found := _verdict(report, part))]
+
+
+def _verdict(report: ScoreReport, part: str) -> list[str]:
+    best = max((ratio for ratio in report.ratios if ratio.part == part), key=lambda ratio: ratio.value, default=None)
+    own = [row for row in report.rows if (row.estimator, row.part, row.by) == (OWN_NAME, part, "part")]
+    held = next((row.value for row in own if row.metric == "coverage_90"), None)
+    sentences = []
+    if best is not None:
+        rival, away = estimator_words(best.rival), f"{abs(1 - best.value):.0%}".replace("%", " %")
+        apart = f"{away} {'below' if best.value < 1 else 'above'} that of the best rival ({rival})"
+        is_certain = best.high < 1 or best.low > 1
+        sentences.append(f"the energy score is {apart}{'' if is_certain else ', which may be chance'};")
+    if held is not None and math.isfinite(held):
+        limits = ((0.5, "do not believe it"), (0.83, "it is too narrow"), (0.96, "as it should"), (math.inf, "it is too wide"))
+        judged = next(words for limit, words in limits if held <= limit)
+        sentences.append(f"the 90 % region holds {100 * held:.0f} % of the truth: {judged}.")
+    return sentences
 
 
 def headline(report: ScoreReport) -> list[dict[str, Any]]:

@@ -92,8 +92,11 @@ def test_scores_as_a_table():
         {"estimator": "hold", "part": "past", "metric": "ade_m", "value": None},
     ]
     assert score_lines(scores) == [
-        "           past ade_m  future ade_m",
-        "  cadence       12.35           100",
-        "     hold           -             -",
+        "                         past:     future:",
+        "                    mean error  mean error",
+        "           cadence      12.3 m       100 m",
+        "  stays where seen           -           -",
     ]
     assert score_lines([]) == []
+    result = StageResult("evaluate", "done", (), {"verdict": ["Past: good."], "scores": scores})
+    assert stage_summary(result).splitlines()[:2] == ["evaluate: done", "  Past: good."]

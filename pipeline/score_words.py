@@ -1,0 +1,36 @@
+"""What the names in tables of scores mean, in words for people."""
+
+from collections.abc import Mapping
+from typing import Final
+
+ESTIMATORS: Final[Mapping[str, str]] = {
+    "bank": "bank of smoothers",
+    "cv": "constant velocity",
+    "ou": "fading velocity",
+    "linear": "straight lines",
+    "hold": "stays where seen",
+}
+"""Rivals of `cadence evaluate`; others are called by their names."""
+
+METRICS: Final[Mapping[str, str]] = {
+    "energy_score_m": "energy score",
+    "ade_m": "mean error",
+    "coverage_90": "in 90 % region",
+}
+"""Headline metrics: the distance of all hypotheses together from the truth (Gneiting and Raftery, 2007; less is better), the
+mean distance of one hypothesis, and the share of the truth that lies in the region of 90 % of the weight (90 % is right)."""
+
+
+def estimator_words(name: str) -> str:
+    """What an estimator is called in a table."""
+    return ESTIMATORS.get(name, name)
+
+
+def value_words(metric: str, value: float | None) -> str:
+    """A value with its unit: shares in per cent, lengths in metres; `-` where there is none."""
+    if value is None:
+        return "-"
+    if metric.startswith("coverage"):
+        return f"{100 * value:.0f} %"
+    number = f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.3g}"
+    return f"{number} m" if metric.endswith("_m") else number
