@@ -14,7 +14,7 @@ import json
 import shlex
 import sys
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -53,8 +53,8 @@ class Measurement:
     tables: dict[str, list[Row]]
 
     def rows(self, more: str = "", **wanted: Value) -> list[Row]:
-        """Rows of NAME_MORE.csv (NAME.csv without `more`) in which these columns have these values."""
-        rows = self.tables[f"{self.name}_{more}" if more else self.name]
+        """Rows of NAME_MORE.csv (NAME.csv without `more`) in which these columns have these values; none of a missing table."""
+        rows = self.tables.get(f"{self.name}_{more}" if more else self.name, [])
         return [row for row in rows if all(row[column] == value for column, value in wanted.items())]
 
 
@@ -68,8 +68,9 @@ def facts_of(name: str, arguments: Sequence[str] | None = None) -> dict[str, Any
 
 
 def publish(measured: Measurement, section: Callable[[Measurement], str], docs: Path | None) -> None:
-    """Print the section; below `docs`, if given, write the files and the section."""
-    text = text_of(measured, section)
+    """Print the section as the files will make it; below `docs`, if given, write both."""
+    as_kept = {name: from_csv(as_csv(rows)) for name, rows in measured.tables.items()}
+    text = text_of(replace(measured, tables=as_kept), section)
     print(text)
     if docs is not None:
         write(measured, docs / "benchmarks" / "data")
@@ -98,10 +99,15 @@ def write(measured: Measurement, folder: Path) -> None:
 def as_csv(rows: Sequence[Row]) -> str:
     """Rows of the same columns, numbers with six digits."""
     text = io.StringIO()
-    writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
+    writer = csv.DictWriter(text, list(rows[0]) if rows else [], lineterminator="\n")
     writer.writeheader()
     writer.writerows({column: _as_text(value) for column, value in row.items()} for row in rows)
     return text.getvalue()
+
+
+def from_csv(text: str) -> list[Row]:
+    """What `as_csv` wrote: numbers where a cell is one, None where it is empty."""
+    return [{column: _as_value(cell) for column, cell in row.items()} for row in csv.DictReader(io.StringIO(text))]
 
 
 def read(name: str, folder: Path) -> Measurement:
@@ -109,8 +115,7 @@ def read(name: str, folder: Path) -> Measurement:
     facts = json.loads((folder / f"{name}.json").read_text(encoding="utf-8"))
     tables: dict[str, list[Row]] = {}
     for table in facts.pop("tables"):
-        with (folder / f"{table}.csv").open(encoding="utf-8", newline="") as file:
-            tables[table] = [{column: _as_value(text) for column, text in row.items()} for row in csv.DictReader(file)]
+        tables[table] = from_csv((folder / f"{table}.csv").read_text(encoding="utf-8"))
     return Measurement(name, facts, tables)
 
 

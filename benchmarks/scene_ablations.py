@@ -277,9 +277,10 @@ def section(measured: Measurement) -> str:
     heads = ["worse than the full network", *(f"{kind}, %" for kind in KINDS)]
     lines = []
     for variant in dict.fromkeys(row["variant"] for row in measured.rows()):
-        rows = [measured.rows(variant=variant, episodes=kind)[0] for kind in KINDS]
         if variant != "full":
-            lines.append([variant, *(publishing.interval(row, "energy_score_cost_percent", "z.0f") for row in rows)])
+            found = [measured.rows(variant=variant, episodes=kind) for kind in KINDS]
+            costs = [publishing.interval(rows[0], "energy_score_cost_percent", "z.0f") if rows else "–" for rows in found]
+            lines.append([variant, *costs])
     return publishing.table(heads, lines)
 
 

@@ -222,7 +222,7 @@ def section(measured: Measurement) -> str:
     for told in ("no", "yes"):
         rows = measured.rows("errors", method=NAMES["cadence"], measure="coverage_90", is_hideout_told=told)
         shares = [100 * row["value"] for row in rows]
-        words.append(f"{min(shares):.0f} to {max(shares):.0f} %")
+        words.append(f"{min(shares):.0f} to {max(shares):.0f} %" if shares else "–")
     budgets = budget_words(measured, ("prison low", "narco low"), ("cadence", "grammi", "vrnn"))
     text = (
         f"{measured.facts['num_windows']} moments a set. CADENCE's 90 % region holds {words[0]} of the truth by set and "
@@ -247,10 +247,11 @@ def lead_table(measured: Measurement, shown: Sequence[str]) -> str:
 
 
 def budget_words(measured: Measurement, sets: Sequence[str], methods: Sequence[str]) -> str:
-    """Windows and processor time of trainings, set by set."""
+    """Windows and processor time of trainings whose checkpoints state them, set by set."""
     parts = []
     for key in sets:
-        found = [row for method in methods for row in measured.rows("budgets", set=key, method=NAMES[method])]
-        words = [f"{row['method']} {row['num_windows'] / 1e6:.1f} ({row['cpu_hours']:.1f} h)" for row in found]
-        parts.append(f"{key.split()[0]} {', '.join(words)}")
+        rows = [row for method in methods for row in measured.rows("budgets", set=key, method=NAMES[method])]
+        stated = [row for row in rows if row["num_windows"] is not None and row["cpu_hours"] is not None]
+        words = [f"{row['method']} {row['num_windows'] / 1e6:.1f} ({row['cpu_hours']:.1f} h)" for row in stated]
+        parts += [f"{key.split()[0]} {', '.join(words)}"] if words else []
     return "; ".join(parts) + " million windows (CPU hours)"

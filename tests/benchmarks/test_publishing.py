@@ -86,6 +86,16 @@ def test_publishing_writes_files_and_section(tmp_path: Path, capsys: pytest.Capt
     assert capsys.readouterr().out == f"{wanted}\n"
 
 
+def test_a_page_is_made_of_what_the_files_keep(tmp_path: Path) -> None:
+    (tmp_path / "benchmarks").mkdir()
+    page = tmp_path / "benchmarks" / "runs.md"
+    page.write_text("<!-- memory begin -->\n\n<!-- memory end -->\n")
+    found = measured(memory=[{"peak_gb": 2 / 3, "aim_gb": float("nan")}])
+    publishing.publish(found, lambda kept: str(kept.rows()), tmp_path)
+    kept = publishing.read("memory", tmp_path / "benchmarks" / "data")
+    assert kept.rows() == [{"peak_gb": 0.666667, "aim_gb": None}] and str(kept.rows()) in page.read_text()
+
+
 @pytest.mark.parametrize(("page", "name"), NAMES)
 def test_a_page_says_what_its_files_hold(page: str, name: str) -> None:
     module = importlib.import_module(f"benchmarks.{name}")
