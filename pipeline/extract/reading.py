@@ -8,7 +8,7 @@ import numpy as np
 
 from pipeline.extract.positions import ChannelReader
 from pipeline.logs.channels import Batch
-from pipeline.logs.decode import UndecodableChannel, UndecodableMessage, decoder_for
+from pipeline.logs.decode import UndecodableChannel, UndecodableMessage, decoder_for, with_definition
 from pipeline.logs.reader import Channel, MissionLog, RawMessage
 from pipeline.logs.records import MAX_TIME_NS
 from pipeline.progress import Progress
@@ -31,10 +31,15 @@ def read_positions(
         by_channel.setdefault(reader.channel.id, []).append(reader)
     feeds: dict[int, _Feed] = {}
     for number, served in by_channel.items():
+        channel = served[0].channel
         try:
-            feeds[number] = _Feed(served[0].channel, served)
+            feeds[number] = _Feed(channel, served)
+            if with_definition(channel) is not channel:
+                progress.note(
+                    f"extract: {channel.topic}: the log has no definition of {channel.schema_name}; the standard one is used"
+                )
         except UndecodableChannel as error:
-            counts["undecodable"] += served[0].channel.message_count or 0
+            counts["undecodable"] += channel.message_count or 0
             progress.note(f"extract: {error}")
     topics = {reader.channel.topic for reader in readers}
 

@@ -7,10 +7,10 @@ arrays for repeated fields. `field` reads both kinds.
 import functools
 import json
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 from mcap.records import Schema
 from mcap_protobuf.decoder import DecoderFactory as ProtobufDecoderFactory
@@ -41,6 +41,13 @@ _STAMPS: Final = {
 }
 
 
+_STANDARD: Final[Mapping[str, tuple[Stores, Literal[1, 2], str]]] = {
+    "cdr": (Stores.ROS2_HUMBLE, 2, "ros2msg"),
+    "ros1": (Stores.ROS1_NOETIC, 1, "ros1msg"),
+}
+"""Whose types stand in for definitions that a log lacks, by the encoding of its messages."""
+
+
 class UndecodableChannel(InputError):
     """No message of the channel can be decoded: unknown encoding, or a schema that is absent or cannot be read."""
 
@@ -54,12 +61,14 @@ def decoder_for(channel: Channel) -> Decoder:
 
     Raises `UndecodableChannel` where there is none; the function raises `UndecodableMessage` on bytes that do not fit.
     """
-    encoding = channel.message_encoding
+    encoding, channel = channel.message_encoding, with_definition(channel)
     with _named(channel, UndecodableChannel, "cannot be decoded"):
         if encoding == "json":
             decode: Decoder = json.loads
         elif not channel.schema_data:
-            raise ValueError(f"encoding {encoding!r} needs a schema, and the log has none for it")
+            raise ValueError(
+                f"encoding {encoding!r} needs a schema, and the log has none for it; record it with its definition"
+            )
         elif encoding == "protobuf":
             decode = _protobuf_decoder(channel)
         elif encoding == "cdr":
@@ -79,6 +88,24 @@ def decoder_for(channel: Channel) -> Decoder:
             raise UndecodableMessage(f"{channel.topic}: a message does not fit its schema ({reason}); it is skipped") from error
 
     return checked
+
+
+def with_definition(channel: Channel) -> Channel:
+    """The channel with the standard definition of its type, where a ROS recorder found none; others as they are."""
+    if channel.schema_data or channel.message_encoding not in _STANDARD:
+        return channel
+    store, version, schema_encoding = _STANDARD[channel.message_encoding]
+    parts = channel.schema_name.replace("::", "/").split("/")
+    name = f"{parts[0]}/msg/{parts[-1]}"
+    text = _standard_definition(store, name, version)
+    return replace(channel, schema_name=name, schema_encoding=schema_encoding, schema_data=text.encode()) if text else channel
+
+
+@functools.lru_cache(maxsize=_MAX_STORES)
+def _standard_definition(store: Stores, type_name: str, ros_version: Literal[1, 2]) -> str:
+    """The definition that a distribution has of a type; empty where it has none."""
+    types = get_typestore(store)
+    return types.generate_msgdef(type_name, ros_version=ros_version)[0] if type_name in types.fielddefs else ""
 
 
 def field(message: Any, path: str) -> Any:
@@ -154,6 +181,7 @@ def cdr_types(channel: Channel) -> tuple[Typestore, str]:
 
     Raises `UndecodableChannel` where the schema cannot be read.
     """
+    channel = with_definition(channel)
     with _named(channel, UndecodableChannel, "cannot be decoded"):
         return _cdr_types(channel.schema_name, channel.schema_encoding, channel.schema_data)
 

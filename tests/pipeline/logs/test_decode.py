@@ -268,6 +268,28 @@ def test_protobuf_bytes_that_do_not_fit_are_an_undecodable_message(shared_data):
         decoder_for(log.channels[0])(b"\xff\xff\xff\xff")
 
 
+@pytest.mark.parametrize(("encoding", "store"), [("cdr", Stores.ROS2_JAZZY), ("ros1", Stores.ROS1_NOETIC)])
+@pytest.mark.parametrize("name", ["sensor_msgs/msg/NavSatFix", "sensor_msgs/NavSatFix", "sensor_msgs::msg::NavSatFix"])
+def test_a_standard_type_whose_definition_the_recorder_did_not_find(encoding, store, name):
+    types = get_typestore(store)
+    header = dict(stamp=types.types["builtin_interfaces/msg/Time"](sec=1, nanosec=2), frame_id="gps")
+    header |= {"seq": 0} if encoding == "ros1" else {}
+    fix = types.types["sensor_msgs/msg/NavSatFix"](
+        header=types.types["std_msgs/msg/Header"](**header),
+        status=types.types["sensor_msgs/msg/NavSatStatus"](status=0, service=1), latitude=50.5, longitude=-1.25, altitude=7.0,
+        position_covariance=np.zeros(9), position_covariance_type=0,
+    )  # fmt: skip
+    data = types.serialize_cdr(fix, fix.__msgtype__) if encoding == "cdr" else types.serialize_ros1(fix, fix.__msgtype__)
+    decoded = decoder_for(channel(encoding, name, "ros2msg"))(bytes(data))
+    assert (decoded.latitude, decoded.longitude, decoded.header.frame_id) == (50.5, -1.25, "gps")
+
+
+@pytest.mark.parametrize("name", ["own_msgs/msg/Thing", "NavSatFix", ""])
+def test_other_types_need_a_definition(name):
+    with pytest.raises(UndecodableChannel, match="the log has none for it; record it with its definition"):
+        decoder_for(channel("cdr", name, "ros2msg"))
+
+
 def test_schema_cannot_smuggle_in_code(tmp_path):
     """Registering a type runs generated code; text from a log must stay text in it."""
     mark = tmp_path / "executed"
