@@ -12,7 +12,7 @@ from typing import Final, NoReturn
 from cadence.errors import CadenceError, InputError, UsageError
 from pipeline.documents import parse_json
 from pipeline.logs.foreign import recordings_below
-from pipeline.logs.parts import METADATA_NAME, group_parts, mission_name, named_parts
+from pipeline.logs.parts import LOG_ENDINGS, METADATA_NAME, group_parts, log_stem, mission_name, named_parts
 from pipeline.stores.objects import StoredObject, find_objects, read_bytes
 from pipeline.stores.urls import is_url, shown, url_name
 
@@ -149,19 +149,29 @@ def _named_in(folder: str, is_listed: bool) -> list[str]:
 
 
 def _logs_below(folder: Path) -> list[Path]:
-    """All logs in `folder` and below it, by their paths; not what CADENCE wrote, and nothing hidden."""
-    return sorted(path for path in folder.rglob("*.mcap") if _is_log(path, folder))
+    """All logs in `folder` and below it, by their paths; not what CADENCE wrote, and nothing hidden.
+
+    Of a log that was unpacked beside its compressed form, the plain one.
+    """
+    found = sorted(path for path in folder.rglob("*.mcap*") if path.name.endswith(LOG_ENDINGS) and _is_log(path, folder))
+    plain = {path for path in found if path.suffix == ".mcap"}
+    return [path for path in found if path in plain or path.with_name(f"{log_stem(path.name)}.mcap") not in plain]
 
 
 def _is_log(path: Path, folder: Path | None = None) -> bool:
     inner = path.relative_to(folder) if folder is not None else Path(path.name)
-    return path.is_file() and not path.name.endswith(_OWN_ENDINGS) and not any(part.startswith(".") for part in inner.parts)
+    return path.is_file() and not _is_own(path.name) and not any(part.startswith(".") for part in inner.parts)
 
 
 def _is_log_name(name: str) -> bool:
     """The same of a name in a store."""
-    is_own = name.endswith(_OWN_ENDINGS)
-    return name.endswith(".mcap") and not is_own and not any(part.startswith(".") for part in name.split("/"))
+    is_hidden = any(part.startswith(".") for part in name.split("/"))
+    return name.endswith(LOG_ENDINGS) and not _is_own(name) and not is_hidden
+
+
+def _is_own(name: str) -> bool:
+    """Whether CADENCE wrote it."""
+    return f"{log_stem(name)}.mcap".endswith(_OWN_ENDINGS)
 
 
 def _place(part: str) -> Path:

@@ -4,12 +4,14 @@ Chunks, attachments and metadata of the source are not unpacked, let alone packe
 source in time; readers that follow the index, and ours, put the messages of both in order.
 """
 
+import os
 from pathlib import Path
 from typing import BinaryIO, Final
 
 from cadence.errors import InputError
 from pipeline.files import replacing
 from pipeline.logs.index import MAX_ID
+from pipeline.logs.packed import unpacked
 from pipeline.logs.reader import Channel, MissionLog, open_log
 from pipeline.logs.recorder import Packing, Recorder
 from pipeline.logs.records import DamagedRecord
@@ -30,7 +32,7 @@ def write_combined(source: Path, side: Path, target: Path, packing: Packing, pro
     added = open_log(side)
     if not added.health.is_complete:
         raise InputError(f"{side}: is damaged ({'; '.join(added.health.problems)}); export again")
-    with replacing(target) as draft, source.open("rb") as source_file, draft.open("wb") as target_file:
+    with replacing(target) as draft, unpacked(source).open("rb") as source_file, draft.open("wb") as target_file:
         found = _read_index(source, source_file, added)
         _copy(source, source_file, target_file, found.data_end, progress)
         # Continued from what the source states, and not computed: where its bytes were changed, the sum stays wrong.
@@ -42,7 +44,7 @@ def write_combined(source: Path, side: Path, target: Path, packing: Packing, pro
 def _read_index(source: Path, file: BinaryIO, added: MissionLog) -> SourceIndex:
     """The index of the source, with room for the channels and schemas of `added`."""
     try:
-        found = read_index(file, source.stat().st_size)
+        found = read_index(file, file.seek(0, os.SEEK_END))
     except DamagedRecord as error:
         raise _damaged(source, str(error)) from error
     num_schemas = len({_schema(channel) for channel in added.channels})

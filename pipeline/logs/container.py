@@ -5,6 +5,7 @@ from pathlib import Path
 
 from mcap.records import ChunkIndex
 
+from pipeline.logs.packed import unpacked
 from pipeline.logs.summary import Summary, read_summary
 
 
@@ -13,8 +14,9 @@ def container_remarks(path: Path) -> tuple[str, ...]:
 
     A damaged end is not remarked on here: the health of the log says what is wrong with it.
     """
-    with path.open("rb") as file:
-        summary, _ = read_summary(file, 0, path.stat().st_size)
+    plain = unpacked(path)
+    with plain.open("rb") as file:
+        summary, _ = read_summary(file, 0, plain.stat().st_size)
     if summary is None:
         return ()
     if not summary.statistics and not summary.chunks and not summary.channels:

@@ -11,6 +11,7 @@ import numpy as np
 from mcap import records
 from mcap.opcode import Opcode
 
+from pipeline.logs.packed import unpacked
 from pipeline.logs.plan import Block, Plan
 from pipeline.logs.records import HEAD, MAGIC, MAX_TIME_NS, DamagedRecord, library_of, parse_message_index, walk
 from pipeline.logs.summary import Summary, read_summary
@@ -19,17 +20,21 @@ from pipeline.logs.summary import Summary, read_summary
 def plan_by_index(path: Path) -> Plan | None:
     """The plan of the file; None where its summary or message indexes are absent or incomplete."""
     try:
-        with path.open("rb") as file:
-            summary, fault = read_summary(file, 0, path.stat().st_size)
+        plain = unpacked(path)
+        with plain.open("rb") as file:
+            size = plain.stat().st_size
+            summary, fault = read_summary(file, 0, size)
             if summary is None or fault or summary.statistics is None:
                 return None
-            return _plan(file, summary, summary.statistics)
+            return _plan(file, size, summary, summary.statistics)
     except (DamagedRecord, OSError):  # the walk says what is wrong
         return None
 
 
-def _plan(file: BinaryIO, summary: Summary, statistics: records.Statistics) -> Plan | None:
-    plan = Plan(channels=summary.channels, schemas=summary.schemas, summary=summary, statistics=statistics, reached_end=True)
+def _plan(file: BinaryIO, size: int, summary: Summary, statistics: records.Statistics) -> Plan | None:
+    plan = Plan(
+        end=size, channels=summary.channels, schemas=summary.schemas, summary=summary, statistics=statistics, reached_end=True
+    )
     plan.library = _library(file)
     for index in summary.chunks.values():
         block = _block(file, index)

@@ -12,11 +12,13 @@ from cadence.errors import InputError
 from pipeline.logs.channels import Batch as Batch
 from pipeline.logs.channels import Channel as Channel
 from pipeline.logs.channels import RawMessage as RawMessage
+from pipeline.logs.compression import ZSTD_MAGIC
 from pipeline.logs.foreign import HEAD_BYTES, kind_of
 from pipeline.logs.health import Health as Health
 from pipeline.logs.health import health_of, united_health
 from pipeline.logs.health import utc as utc
 from pipeline.logs.indexed import plan_by_index
+from pipeline.logs.packed import in_proportion, unpacked
 from pipeline.logs.parts import missing_parts, mission_name
 from pipeline.logs.plan import Plan
 from pipeline.logs.recordings import scan_log
@@ -150,16 +152,20 @@ def reopen(paths: Sequence[Path], health: Health, on_bytes: OnBytes | None = Non
     if not health.problems:
         plans = [plan for plan in map(plan_by_index, paths) if plan is not None]
         if len(plans) == len(paths) and sum(plan.counts().total() for plan in plans) == health.num_messages:
-            sources = [_source_of(path, plan, path.stat().st_size) for path, plan in zip(paths, plans, strict=True)]
+            sources = [_source_of(path, plan, plan.end) for path, plan in zip(paths, plans, strict=True)]
             return _log_of(paths[0], sources, health, plans[0].library)
     return open_parts(paths, on_bytes)
 
 
 def _checked(path: Path, on_bytes: OnBytes | None) -> tuple[list[Source], Health, str]:
     """The recordings in a file, every checksum checked, its health, and who wrote it."""
-    size = _check_magic(path)
+    size = packed_size = _check_magic(path)
     try:
-        plans = scan_log(path, size, on_bytes)
+        plain = unpacked(path, in_proportion(on_bytes, packed_size, packed_size // 2))
+        if plain != path:
+            size = plain.stat().st_size
+            on_bytes = in_proportion(on_bytes, size, packed_size - packed_size // 2)
+        plans = scan_log(plain, size, on_bytes)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); check the disk") from error
     ends = [*(plan.begin for plan in plans[1:]), size]
@@ -198,7 +204,7 @@ def _check_magic(path: Path) -> int:
         raise InputError(f"{path}: cannot be read ({error}); check the permissions") from error
     if size == 0:
         raise InputError(f"{path}: is empty; nothing was recorded, or the copy failed")
-    if not head.startswith((MAGIC, TEXT_MAGIC)):
+    if not head.startswith((MAGIC, TEXT_MAGIC, ZSTD_MAGIC)):
         raise InputError(f"{path}: is not an MCAP file but {kind_of(path, head)}")
     return size
 

@@ -17,6 +17,7 @@ import numpy as np
 from cadence.errors import InputError
 from pipeline.arrays import Int64s
 from pipeline.logs.channels import Batch, Channel, RawMessage, batches_of, raw_messages
+from pipeline.logs.packed import unpacked
 from pipeline.logs.plan import Block
 from pipeline.logs.records import (
     MAX_TIME_NS,
@@ -202,7 +203,7 @@ def read_span(file: BinaryIO, offset: int, length: int) -> bytes:
 def reading(path: Path) -> Iterator[BinaryIO]:
     """The file at `path`, which was there before; whatever goes wrong becomes an `InputError`."""
     try:
-        file = path.open("rb")
+        file = unpacked(path).open("rb")
     except OSError as error:
         raise InputError(f"{path}: cannot be read any more ({error.strerror}); was it moved?") from error
     try:
