@@ -357,7 +357,7 @@ def draw_two(drawn: HypothesisSet, windows: ForecastWindows) -> plt.Figure:
     nearest_m = np.linalg.norm(absolute - centre, axis=-1).max(axis=2).min(axis=-1)  # [B, K] of the agent farthest from all
     is_apart = nearest_m > APART_M
     window = int((np.minimum(has_met.mean(axis=1), is_apart.mean(axis=1)) - is_near.any(axis=1)).argmax())
-    figure, axes = plt.subplots(1, 2, figsize=(13, 6.5), layout="constrained", sharex=True, sharey=True)
+    figure, axes = plt.subplots(1, 2, figsize=(13, 7.0), layout="constrained", sharex=True, sharey=True)
     for axis, kind, title in zip(axes, (True, False), ("one that meets", "one that goes straight on"), strict=True):
         of_kind = (has_met if kind else is_apart)[window]
         chosen = int(np.where(of_kind, -nearest_m[window] if kind else nearest_m[window], -np.inf).argmax())
