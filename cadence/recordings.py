@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from cadence.arrays import Bools, Float32s, Float64s, Int64s
+from cadence.seeds import derived_seeds, part_seeds
 from cadence.types import Context, Detections, WindowBatch
 
 NUM_STEPS = 120
@@ -178,7 +179,7 @@ class ForecastWindows:
         rows = self[window]
         d, goal = self.windows.detections, self.context.known_goal_m
         columns = (value.flatten(0, 1)[:, None] for value in (d.time_s, d.position_m, d.covariance_m2, d.is_observed))
-        seeds = rows.windows.seeds * size + torch.arange(size).repeat(len(self))
+        seeds = part_seeds(rows.windows.seeds, "agent", torch.arange(size).repeat(len(self)))
         context = dataclasses.replace(rows.context, known_goal_m=None if goal is None else goal.flatten(0, 1)[:, None])
         alone = WindowBatch(self.windows.time_s, Detections(*columns), seeds, self.windows.origin_index, context)
         return dataclasses.replace(rows, windows=alone, truth_m=self.truth_m.flatten(0, 1)[:, None])
@@ -255,7 +256,7 @@ def cut_windows(
         tracker_m=torch.from_numpy(_trackers(recordings, begin[::agents], now[::agents], num_tracker_steps)),
     )
     return ForecastWindows(
-        WindowBatch(time_s, detections, torch.from_numpy((seed * 1_000_003 + episode) * 10_007 + step), 0, context),
+        WindowBatch(time_s, detections, torch.from_numpy(derived_seeds(seed, "window", episode, step)), 0, context),
         torch.from_numpy(by_window(place[later]) - datum[:, None, None]),
         torch.from_numpy(np.asarray(episode, dtype=np.int64)),
         torch.from_numpy(np.asarray(step, dtype=np.int64)),

@@ -22,6 +22,7 @@ from cadence.association.types import CLUTTER, AssociationConfig, Associations, 
 from cadence.constraints.obstacles import Obstacles
 from cadence.errors import InputError
 from cadence.resampling import systematic
+from cadence.seeds import part_seeds
 from cadence.types import WindowBatch
 from pipeline.arrays import Float64s, Int64s
 from pipeline.tracks import DetectionTrack, track_of
@@ -266,7 +267,7 @@ class WayWindows:
         laid_out = self._laid_out(index, self.windows.agent_ids, chosen)
         # windows that differ in their way alone must not share their random numbers
         rank = np.arange(len(chosen)) - np.searchsorted(chosen, chosen)
-        seeds = (laid_out.batch.seeds + torch.from_numpy(rank) * 15_485_863) % 2**62
+        seeds = part_seeds(laid_out.batch.seeds, "way", torch.from_numpy(rank))
         return replace(laid_out, batch=replace(laid_out.batch, seeds=seeds)), chosen, np.array(count)
 
     def _laid_out(self, index: list[list[Int64s]], names: tuple[str, ...], window: Int64s) -> MissionWindows:

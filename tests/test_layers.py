@@ -26,7 +26,7 @@ SOURCES = sorted(
 FLOORS = {
     "cadence": (
         {"arrays", "errors", "schedule"},
-        {"constraints", "metrics", "resampling"},
+        {"constraints", "metrics", "resampling", "seeds"},
         {"association", "types"},
         {"bank", "recordings"},
         {"network", "worlds"},

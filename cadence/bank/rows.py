@@ -22,6 +22,7 @@ def active_rows(windows: WindowBatch) -> tuple[Nodes, Tensor]:
     # padding repeats the last detection's time, so that time never runs backwards
     times = torch.where(observed, times, torch.full_like(times, -math.inf)).cummax(dim=1).values
     agent = torch.arange(windows.num_agents).expand(active.shape)
+    # windows' seeds are hashes: no two rows of a mission meet
     seeds = (windows.seeds[:, None] * 1_000_003 + agent * 7_919)[active] % (2**62)
     return Nodes(times, columns[1].double(), columns[2].double(), observed), seeds
 

@@ -18,6 +18,7 @@ from cadence.diffusion.absolute import detection_rows
 from cadence.diffusion.noise import mirrored
 from cadence.errors import ConfigError
 from cadence.network.encoder import DetectionEncoder
+from cadence.seeds import torch_stream
 from cadence.types import Context, Detections, HypothesisSet, WindowBatch
 
 HORIZONS = (0, 29, 59, 89, 119)
@@ -27,8 +28,6 @@ _ROWS_AT_ONCE = 64
 """Sequences of similar length that one LSTM call takes: enough to keep it busy, few enough to waste little on padding."""
 _SHORT = 32
 """Sequences of no more rows than this waste little in any case."""
-_LATENT_STREAM = 2_147_483_647
-"""Keeps the stream of latent noise apart from that of the draws."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -352,7 +351,7 @@ class MixtureModel:
         r, n = inputs.is_observed.shape
         noise = torch.zeros(r, n, self.network.latent_size)
         for row, (seed, count) in enumerate(zip(seeds.tolist(), inputs.is_observed.sum(dim=1).tolist(), strict=True)):
-            stream = torch.Generator().manual_seed(seed ^ _LATENT_STREAM)
+            stream = torch_stream(seed, "latent")
             noise[row, :count] = torch.randn(count, self.network.latent_size, generator=stream)
         return noise
 

@@ -7,9 +7,8 @@ from torch import Tensor
 
 from cadence.diffusion.scene_frame import SceneConfig
 from cadence.network.attention import Team
+from cadence.seeds import part_seeds
 from cadence.types import Detections, WindowBatch
-
-_AGENT_SEED = 7_919
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -52,7 +51,7 @@ def agent_rows(windows: WindowBatch, config: SceneConfig) -> AgentRows:
 def _rows(windows: WindowBatch, window: Tensor, agent: Tensor, source: Tensor, is_real: Tensor, team: Team | None) -> AgentRows:
     d = windows.detections
     columns = (d.time_s, d.position_m, d.covariance_m2, d.is_observed)
-    seeds = windows.seeds[window] + _AGENT_SEED * agent
+    seeds = part_seeds(windows.seeds[window], "agent", agent)
     context = windows.required_context("agent_rows")
     goal = context.known_goal_m
     mine = dataclasses.replace(context[window], known_goal_m=None if goal is None else goal[window, source][:, None])

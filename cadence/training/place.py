@@ -12,6 +12,7 @@ from cadence.diffusion.scene import SceneModel, SceneSampling
 from cadence.diffusion.scene_frame import SceneConfig
 from cadence.network.scene import SceneNetwork, SceneNetworkConfig
 from cadence.recordings import Recordings
+from cadence.seeds import numpy_stream, torch_stream
 from cadence.training.loop import OptimiserConfig, Trainer, untrained
 from cadence.training.scene import Dropout, diffusion_loss, scene_windows
 
@@ -65,10 +66,10 @@ def train_place(
     config = config or place_config(recordings)
     trainer = Trainer(untrained(config.build, seed), optimiser or OptimiserConfig())
     for step in range(trainer.config.num_steps):
-        rng = np.random.default_rng([seed, step])
+        rng = numpy_stream(seed, "windows", step)
         rows = rng.integers(0, len(recordings.position_m), batch_size)
         windows = scene_windows(recordings, rows, config, Dropout(), rng)
-        generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
+        generator = torch_stream(seed, "step", step)
 
         def loss(network: torch.nn.Module) -> torch.Tensor:
             assert isinstance(network, SceneNetwork)

@@ -3,11 +3,11 @@
 from pathlib import Path
 from typing import Protocol
 
-import numpy as np
 import torch
 
 from cadence.errors import InputError
 from cadence.network.residual import ResidualNetwork
+from cadence.seeds import derived_seed, numpy_stream
 from cadence.training.loop import Trainer, untrained
 from cadence.training.residual import residual_loss
 from cadence.training.synthetic import ResidualWindows, join_windows, residual_windows
@@ -21,7 +21,6 @@ from pipeline.train.run import TrainingRun, run_training
 from pipeline.train.shards import synthetic_shard
 from pipeline.windows import GridConfig, build_windows, plan_grid, truth_on_grid
 
-_VALIDATION_SEED_OFFSET = 500_009
 _VALIDATION_BATCH = 256
 _VALIDATION_SHARE = 0.1
 _STEPS_A_SHARD = 120
@@ -53,7 +52,7 @@ class _SyntheticSource:
     def __init__(self, out: Path, config: TrainConfig) -> None:
         self.folder, self.config = out / "windows", config
         self.shards: dict[int, ResidualWindows] = {}
-        seed = config.seed + _VALIDATION_SEED_OFFSET
+        self.seed, seed = derived_seed(config.seed, "training"), derived_seed(config.seed, "validation")
         numbers = range(config.num_validation_shards)
         self.validation = join_windows([synthetic_shard(self.folder, config.windows, seed, index) for index in numbers])
 
@@ -62,7 +61,7 @@ class _SyntheticSource:
         parts = []
         for index in torch.randint(num_open, (2,), generator=generator).tolist():
             if index not in self.shards:
-                self.shards[index] = synthetic_shard(self.folder, self.config.windows, self.config.seed, index)
+                self.shards[index] = synthetic_shard(self.folder, self.config.windows, self.seed, index)
             shard = self.shards[index]
             parts.append(shard[torch.randint(len(shard), (self.config.batch_size // 2,), generator=generator)])
         return join_windows(parts)
@@ -76,8 +75,8 @@ class _LogSource:
         missions = missions_of_logs(config.data, out / "logs", config.extract, progress)
         if len(missions) < 2:
             raise InputError(f"{config.data}: one usable log; at least two are needed, as whole logs are kept for validation")
-        order = np.random.default_rng([config.seed, 1]).permutation(len(missions)).tolist()
-        parts = [mission_windows(missions[index], config, config.seed + index) for index in order]
+        order = numpy_stream(config.seed, "missions").permutation(len(missions)).tolist()
+        parts = [mission_windows(missions[index], config, derived_seed(config.seed, "mission", index)) for index in order]
         usable = [part for part in parts if part is not None]
         if len(usable) < 2:
             raise InputError(

@@ -7,6 +7,7 @@ from typing import Generic, Protocol, Self, TypeVar
 import torch
 from torch import Tensor, nn
 
+from cadence.seeds import torch_stream
 from cadence.training.loop import Loss
 
 
@@ -36,7 +37,7 @@ class Lessons(Generic[W]):
 
     def loss_at(self, step: int, seed: int) -> Loss:
         """The loss of a step, its windows and random numbers closed over."""
-        generator = torch.Generator().manual_seed(seed * 7_919 + step)
+        generator = torch_stream(seed, "step", step)
         windows = self.batch(step, generator)
         return lambda network: self.loss(network, windows, generator)
 

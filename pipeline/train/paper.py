@@ -16,6 +16,7 @@ from cadence.diffusion.absolute import AbsoluteConfig, detection_rows
 from cadence.errors import ConfigError, InputError
 from cadence.network.trajectory import TrajectoryNetwork
 from cadence.recordings import Recordings, cut_windows
+from cadence.seeds import derived_seed, numpy_stream, torch_stream
 from cadence.training.absolute import AbsoluteWindows, absolute_loss, forecast_rows, join_absolute
 from cadence.training.loop import Trainer, untrained
 from cadence.worlds.patrol import simulate_patrol
@@ -29,7 +30,6 @@ from pipeline.train.missions import TrainingMission, mission_of_episode, mission
 from pipeline.train.run import TrainingRun, run_training
 from pipeline.windows import Grid, MissionWindows, build_windows, truth_on_grid
 
-_VALIDATION_SEED_OFFSET = 500_009
 _VALIDATION_BATCH = 256
 _STEPS_AN_EPISODE = 10
 """A new simulated episode joins after this many steps, so that simulating does not hold up the start."""
@@ -88,12 +88,12 @@ class _EpisodeSource:
         else:
             self.pool, held_out = self.pool.split(paper.validation_share)
         self.model = paper.model_config(*_map_limits(paper, [part.position_m.T for part in self.pool.parts]))
-        drawn = held_out.rows_of_each(paper.num_validation_windows, np.random.default_rng([config.seed, 1, 2]))
+        drawn = held_out.rows_of_each(paper.num_validation_windows, numpy_stream(config.seed, "validation"))
         windows = join_absolute([self._cut(part, rows) for part, rows in drawn])
-        self.validation = self._hidden(windows, torch.Generator().manual_seed(config.seed))
+        self.validation = self._hidden(windows, torch_stream(config.seed, "hidden goals"))
 
     def batch(self, step: int, generator: torch.Generator) -> AbsoluteWindows:
-        rng = np.random.default_rng([self.seed, step])
+        rng = numpy_stream(self.seed, "windows", step)
         drawn = self.pool.rows(self.batch_size, rng)
         return self._hidden(join_absolute([self._cut(part, rows) for part, rows in drawn]), generator)
 
@@ -121,16 +121,16 @@ class _LogSource:
         missions = missions_of_logs(config.data, out / "logs", config.extract, progress)
         if len(missions) < 2:
             raise InputError(f"{config.data}: one usable log; at least two are needed, as whole logs are kept for validation")
-        order = np.random.default_rng([config.seed, 1]).permutation(len(missions))
+        order = numpy_stream(config.seed, "missions").permutation(len(missions))
         num_validation = min(max(1, round(paper.validation_share * len(missions))), len(missions) - 1)
         kept = [missions[index] for index in sorted(order[num_validation:])]
         held_out = [missions[index] for index in sorted(order[:num_validation])]
         places = [np.stack([mission.truth[name].to_numpy() for name in ("x_m", "y_m")]) for mission in kept]
         self.model, self.batch_size = paper.model_config(*_map_limits(paper, places)), config.batch_size
-        make = functools.partial(mission_windows, training=paper, model=self.model)
-        self.windows = _joined([make(mission, seed=config.seed + i) for i, mission in enumerate(kept)], config.data)
-        offset = config.seed + _VALIDATION_SEED_OFFSET
-        self.validation = _joined([make(mission, seed=offset + i) for i, mission in enumerate(held_out)], config.data)
+        self.windows, self.validation = (
+            _joined([mission_windows(m, paper, self.model, derived_seed(config.seed, part, i)) for i, m in ms], config.data)
+            for part, ms in (("training", enumerate(kept)), ("validation", enumerate(held_out)))
+        )
 
     def batch(self, step: int, generator: torch.Generator) -> AbsoluteWindows:
         return self.windows[torch.randint(len(self.windows), (self.batch_size,), generator=generator)]
@@ -144,8 +144,7 @@ class _PatrolSource:
         centre = paper.centre_m or (0.0, 0.0)
         self.model = paper.model_config(centre, paper.scale_m or 0.5 * paper.patrol.side_m)
         self.episodes: dict[int, AbsoluteWindows] = {}
-        offset = config.seed + _VALIDATION_SEED_OFFSET
-        self.validation = join_absolute([self._simulated(offset, i) for i in range(paper.num_validation_episodes)])
+        self.validation = join_absolute([self._simulated("validation", i) for i in range(paper.num_validation_episodes)])
         if len(self.validation) == 0:
             raise ConfigError("train.paper.patrol: no window of the validation episodes has a detection; raise detection_rate")
 
@@ -163,13 +162,14 @@ class _PatrolSource:
 
     def _episode(self, index: int) -> AbsoluteWindows:
         if index not in self.episodes:
-            self.episodes[index] = self._simulated(self.config.seed, index)
+            self.episodes[index] = self._simulated("training", index)
         return self.episodes[index]
 
-    def _simulated(self, seed: int, index: int) -> AbsoluteWindows:
-        episode = simulate_patrol(self.config.paper.patrol, np.random.default_rng([seed, index]))
-        mission = mission_of_episode(episode, f"patrol-{seed}-{index}")
-        return mission_windows(mission, self.config.paper, self.model, seed * 1_000_003 + index)
+    def _simulated(self, part: str, index: int) -> AbsoluteWindows:
+        seed = derived_seed(self.config.seed, part, index)
+        episode = simulate_patrol(self.config.paper.patrol, numpy_stream(seed, "episode"))
+        mission = mission_of_episode(episode, f"{part}-{index}")
+        return mission_windows(mission, self.config.paper, self.model, seed)
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,7 +186,7 @@ def draw_windows(mission: TrainingMission, training: AbsoluteTraining, model: Ab
     """`num_windows` windows of a mission with at least one detection, at random whole steps after its first truth sample."""
     step_ns = round(model.step_s * 1e9)
     times = mission.truth["time_ns"].to_numpy()
-    rng = np.random.default_rng([seed, 2])
+    rng = numpy_stream(seed, "origins")
     num_steps = max(1, int(times.max() - times.min()) // step_ns + 1)
     origins = times.min() + step_ns * np.sort(rng.integers(0, num_steps, training.num_windows))
     grid = Grid(step_ns, model.history_steps, model.horizon_steps, origins, training.context_steps)

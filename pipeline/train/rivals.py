@@ -4,7 +4,6 @@ import copy
 import dataclasses
 import functools
 import json
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +16,7 @@ from cadence.baselines.mixture import HistoryConfig, MixtureFrame
 from cadence.baselines.vrnn import VrnnNetwork
 from cadence.errors import ConfigError
 from cadence.recordings import Recordings, cut_windows
+from cadence.seeds import numpy_stream, torch_stream
 from cadence.training.loop import Trainer, untrained
 from cadence.training.mixtures import MixtureWindows, grammi_loss, hidden_goals, mixture_windows, vrnn_loss
 from pipeline.checkpoints import (
@@ -38,7 +38,6 @@ from pipeline.train.run import OUTPUTS, TrainingRun, run_training
 
 _BATCHES_A_BLOCK = 32
 """Batches cut at once: cutting has a fixed cost that goes with the recordings."""
-_VALIDATION_STREAM = 500_009
 _VALIDATION_BATCH = 512
 _MARGIN = 1.02
 """Map limits taken from the recordings get this much room."""
@@ -95,8 +94,8 @@ def _train(
     description = VrnnConfig(rival.vrnn, frame) if config.preset == "vrnn" else GrammiConfig(rival.grammi, frame)
     history, horizons = description.network.history, description.network.horizons
     source = _Source(recordings, frame, history, horizons, config.seed, config.batch_size)
-    checks = _cut(validation, frame, history, horizons, rival.num_validation_windows, [config.seed, _VALIDATION_STREAM])
-    checks = hidden_goals(checks, rival.hidden_goals, torch.Generator().manual_seed(1))
+    checks = _cut(validation, frame, history, horizons, rival.num_validation_windows, numpy_stream(config.seed, "validation"))
+    checks = hidden_goals(checks, rival.hidden_goals, torch_stream(config.seed, "hidden goals"))
     trainer = Trainer(untrained(lambda: _network(description, rival.start), config.seed), optimiser)
 
     def batch(step: int, generator: torch.Generator) -> MixtureWindows:
@@ -169,7 +168,7 @@ class _Source:
     def batch(self, step: int) -> MixtureWindows:
         number, index = divmod(step, _BATCHES_A_BLOCK)
         if self.block is None or self.block[0] != number:
-            self.block = number, self.cut(_BATCHES_A_BLOCK * self.batch_size, [self.seed, number])
+            self.block = number, self.cut(_BATCHES_A_BLOCK * self.batch_size, numpy_stream(self.seed, "windows", number))
         return self.block[1][slice(index * self.batch_size, (index + 1) * self.batch_size)]
 
 
@@ -179,10 +178,10 @@ def _cut(
     history: HistoryConfig,
     horizons: tuple[int, ...],
     num_windows: int,
-    seed: Sequence[int],
+    rng: np.random.Generator,
 ) -> MixtureWindows:
     """Random windows as the network sees them."""
-    rows = np.random.default_rng(list(seed)).integers(0, len(recordings.position_m), num_windows)
+    rows = rng.integers(0, len(recordings.position_m), num_windows)
     episode = np.searchsorted(recordings.offset, rows, side="right") - 1
     windows = cut_windows(
         recordings,

@@ -3,13 +3,13 @@
 import dataclasses
 from pathlib import Path
 
-import numpy as np
 import torch
 from torch import nn
 
 from cadence.diffusion.scene_frame import SceneConfig
 from cadence.network.attention import Team
 from cadence.network.scene import Pieces, SceneInputs, SceneNetwork
+from cadence.seeds import numpy_stream
 from cadence.training.loop import Trainer, untrained
 from cadence.training.scene import SceneWindows, diffusion_loss, energy_loss, scene_windows
 from pipeline.checkpoints import find_checkpoint, load_weights
@@ -52,7 +52,7 @@ def train_scene_network(
     model = _model_config(scene)
 
     def batch(step: int, generator: torch.Generator) -> SceneWindows:
-        rng = np.random.default_rng([config.seed, step])
+        rng = numpy_stream(config.seed, "windows", step)
         drawn = pool.rows(config.batch_size, rng)
         return _joined([scene_windows(part, rows, model, scene.told, rng) for part, rows in drawn])
 
@@ -62,7 +62,7 @@ def train_scene_network(
             return diffusion_loss(network, windows, model, scene.path_weight, generator)
         return energy_loss(network, windows, model, scene.num_samples, scene.score_weights, generator)
 
-    rng = np.random.default_rng([config.seed, 1, 2])
+    rng = numpy_stream(config.seed, "validation")
     checks = held_out.rows_of_each(scene.num_validation_windows, rng)
     validation = _joined([scene_windows(part, rows, model, scene.told, rng) for part, rows in checks])
     lessons = Lessons(batch, loss, list(validation.parts(_VALIDATION_BATCH)))

@@ -12,6 +12,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file
 
 from cadence.network.residual_context import ResidualContext
+from cadence.seeds import derived_seed
 from cadence.training.synthetic import ResidualWindows, SyntheticConfig, synthesise
 from pipeline.checkpoints import write_tensors
 
@@ -29,7 +30,7 @@ def synthetic_shard(folder: Path, config: SyntheticConfig, seed: int, index: int
     path = folder / f"synthetic-{made_by}-{seed}-{index:05d}.safetensors"
     found = read_windows(path)
     if found is None:
-        found = synthesise(config, seed * 1_000_003 + index, SCENARIOS_PER_SHARD)
+        found = synthesise(config, derived_seed(seed, "shard", index), SCENARIOS_PER_SHARD)
         write_windows(found, path)
         # as it will be read: a training that was killed must not go on with other numbers than one that was not
         found = dataclasses.replace(found, sample=found.sample.to(torch.float16).float())
