@@ -18,7 +18,7 @@ from cadence.association.associate import associate
 from cadence.association.fitting import fit_habits
 from cadence.association.particles import Stream
 from cadence.association.presence import Habits
-from cadence.association.types import CLUTTER, AssociationConfig, Associations, agent_probability
+from cadence.association.types import CLUTTER, AssociationConfig, Associations, agent_probability, without_unlikely
 from cadence.constraints.obstacles import Obstacles
 from cadence.errors import InputError
 from cadence.resampling import systematic
@@ -191,6 +191,8 @@ class _Nameless:
         ways = associate(
             stream.time_s, stream.position_m, stream.covariance_m2, self._seconds(origins_ns), config, seed, habits=habits
         )
+        if config.num_agents is None:
+            ways = without_unlikely(ways)
         numbers = (number for number in itertools.count() if f"a{number}" not in self.taken)
         agent_ids = tuple(f"a{number}" for number in itertools.islice(numbers, ways[-1].num_agents))
         return Association(self.track, self.row, origins_ns, tuple(ways), agent_ids)

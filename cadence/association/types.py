@@ -1,11 +1,13 @@
 """Settings and results of data association. Arrays are numpy: labels, not tensors that a network sees."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from cadence.arrays import Float64s, Int64s
 
+_LEAST_PROBABILITY = 0.5
 CLUTTER = -1
 """Label of a detection that no agent caused."""
 
@@ -68,6 +70,21 @@ class Associations:
     def num_detections(self) -> int:
         """Number of detections N."""
         return int(self.label.shape[1])
+
+
+def without_unlikely(moments: Sequence[Associations]) -> list[Associations]:
+    """The same at each moment without the agents that at none of them are likelier there than not: theirs is clutter.
+
+    The second detection of a target may as well be another's; once there are three nobody thinks so.
+    """
+    num_agents = max((found.num_agents for found in moments), default=0)
+    most = np.zeros(num_agents)
+    for found in moments:
+        for agent in range(found.num_agents):
+            most[agent] = max(most[agent], found.weight @ (found.label == agent).any(axis=1))
+    is_likely = most > _LEAST_PROBABILITY
+    name = np.append(np.where(is_likely, np.cumsum(is_likely) - 1, CLUTTER), CLUTTER)  # the last answers for clutter
+    return [Associations(name[found.label], found.weight, int(is_likely.sum())) for found in moments]
 
 
 def agent_probability(associations: Associations) -> Float64s:

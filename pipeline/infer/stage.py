@@ -85,7 +85,7 @@ def _draw(plan: "_Plan", log_id: str, folder: Path, frame: Frame, progress: Prog
     counts = windows["status"].value_counts().to_pylist()
     return {
         "num_windows": plan.windows.batch.num_windows,
-        "num_agents": len(plan.windows.agent_ids),
+        "num_agents": pc.count_distinct(tracks["agent_id"]).as_py(),
         "num_tracks": tracks.num_rows,
         "status": {str(item["values"]): int(item["counts"]) for item in counts},
     }

@@ -8,7 +8,7 @@ from cadence.association.associate import associate
 from cadence.association.fitting import fit_habits
 from cadence.association.naming import named_like
 from cadence.association.particles import Stream
-from cadence.association.types import CLUTTER, AssociationConfig, Associations, agent_probability
+from cadence.association.types import CLUTTER, AssociationConfig, Associations, agent_probability, without_unlikely
 
 KNOWN = AssociationConfig(num_agents=2, num_particles=40)
 
@@ -114,6 +114,19 @@ def test_agents_come_and_go_where_their_number_is_unknown():
     assert set(early.label[0].tolist()) == {0}
     assert same_partition(late.label[0], is_second)
     assert late.num_agents == early.num_agents
+
+
+def test_agents_that_are_never_likely_are_clutter():
+    """Of three agents the second is likelier absent than there, at first and, with other weights, later on."""
+    first = Associations(np.array([[0, 1], [0, 0]]), np.array([0.3, 0.7]), 3)
+    last = Associations(np.array([[0, 1, 2], [0, 0, 2], [-1, 0, 2]]), np.array([0.5, 0.3, 0.2]), 3)
+    early, late = without_unlikely([first, last])
+    assert early.label.tolist() == [[0, CLUTTER], [0, 0]] and early.num_agents == late.num_agents == 2
+    assert late.label.tolist() == [[0, CLUTTER, 1], [0, 0, 1], [CLUTTER, 0, 1]]
+    assert late.weight.tolist() == last.weight.tolist()
+    likelier = Associations(first.label, np.array([0.6, 0.4]), 3)
+    assert [found.num_agents for found in without_unlikely([likelier, last])] == [3, 3]
+    assert without_unlikely([Associations(np.zeros((1, 0), np.int64), np.ones(1), 0)])[0].num_agents == 0
 
 
 @pytest.mark.parametrize("number", [0, 1])

@@ -168,9 +168,8 @@ def test_an_agent_may_be_missing_from_a_hypothesis(tmp_path: Path, monkeypatch: 
     directory = mission(tmp_path, detections())
     infer(directory, CONFIG, QUIET)
     for window in read_hypothesis_tables(directory).windows:
-        first, second, third = window.agents
-        assert (first.probability, second.probability, third.probability) == (1.0, 0.75, 0.0)
-        assert np.isfinite(first.position_m).all() and not third.is_live and third.status == "no_detections"
+        first, second = window.agents  # the third is nowhere
+        assert (first.probability, second.probability) == (1.0, 0.75) and np.isfinite(first.position_m).all()
         is_there = np.isfinite(second.position_m).all(axis=(1, 2))
         assert is_there.sum() == 6 and np.isnan(second.position_m[~is_there]).all()
         assert second.spread_m is not None and np.isfinite(second.spread_m) and second.num_detections == 4
