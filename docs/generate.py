@@ -21,7 +21,7 @@ import typer.testing
 
 import cli
 from pipeline.config import TABLES
-from pipeline.mapping.presets import PRESETS
+from pipeline.mapping.message_types import MESSAGE_TYPES
 
 COMMANDS = ("info", "doctor", "run", "ingest", "extract", "infer", "export", "report", "evaluate", "simulate", "train")
 
@@ -57,7 +57,7 @@ num_hypotheses = 50
 """
 
 
-PRESETS_INTRODUCTION = """Message types whose fields are known. A source without paths takes the preset of its channel's schema.
+MESSAGE_TYPES_INTRODUCTION = """Message types whose fields are known. A source without paths takes that of its channel's schema.
 """
 
 
@@ -77,9 +77,9 @@ def configuration_page() -> str:
         cls = stage_config_class(table)
         parts.append(f"## [{table}]\n")
         parts += _tables_of(cls, table, described)
-    parts += ["## Presets\n", PRESETS_INTRODUCTION, "| preset | schemas (in any spelling) |", "|---|---|"]
-    for name, preset in sorted(PRESETS.items()):
-        parts.append(f"| `{name}` | {', '.join(f'`{schema}`' for schema in preset.schemas)} |")
+    parts += ["## Message types\n", MESSAGE_TYPES_INTRODUCTION, "| `message_type` | schemas (in any spelling) |", "|---|---|"]
+    for name, known in sorted(MESSAGE_TYPES.items()):
+        parts.append(f"| `{name}` | {', '.join(f'`{schema}`' for schema in known.schemas)} |")
     return "\n".join(parts) + "\n"
 
 

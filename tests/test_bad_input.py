@@ -139,9 +139,9 @@ def test_out_of_order_time_stamps_give_the_same_detections(tmp_path, out, capsys
         ('topic = "/nope"', "/nope"),
         ('topic = "/detections/target"\nx = "pose.position.east"\ny = "pose.position.y"', "east"),
         ('topic = "/detections/target"\nx = "pose..x"\ny = "pose.position.y"', "pose..x"),
-        ('topic = "/detections/target"\npreset = "Nope"', "Nope"),
+        ('topic = "/detections/target"\nmessage_type = "Nope"', "Nope"),
     ],
-    ids=["topic", "field", "path", "preset"],
+    ids=["topic", "field", "path", "message_type"],
 )
 def test_mapping_that_does_not_fit_is_refused(source, says, tmp_path, out, capsys):
     config = tmp_path / "c.toml"

@@ -145,7 +145,7 @@ class ChannelReader:
         if name == "time" and self.source.time in (LOG_TIME, PUBLISH_TIME):
             return FieldReader(())
         is_stated = getattr(self.source, PATH_KEYS.get(name, name), None) is not None
-        is_position = name in ("x", "y", "latitude", "longitude") and self.source.preset is not None and self.is_stated
+        is_position = name in ("x", "y", "latitude", "longitude") and self.source.message_type is not None and self.is_stated
         return FieldReader(paths, bool(paths) and (is_stated or is_position), _CONVERSIONS.get(name))
 
     def read(self, message: Any, raw: RawMessage) -> None:

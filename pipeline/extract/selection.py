@@ -7,7 +7,7 @@ from cadence.errors import ConfigError, InputError, NothingDetectedError
 from pipeline.extract.positions import ChannelReader
 from pipeline.extract.thinning import ThinningConfig
 from pipeline.logs.reader import Channel
-from pipeline.mapping.guess import SuggestedMapping, dense_sources, describe_channels, suggest_mapping, usable_preset
+from pipeline.mapping.guess import SuggestedMapping, dense_sources, describe_channels, suggest_mapping, usable_type
 from pipeline.mapping.sources import SourceConfig
 from pipeline.suggestions import by_likeness, did_you_mean
 
@@ -116,21 +116,24 @@ def _readers(
     return [
         ChannelReader(channel, source, role, is_stated, found)
         for channel, found in named
-        if source.preset in (None, usable_preset(channel)) or not _is_left_out(channel, source, sources, is_stated, channels)
+        if source.message_type in (None, usable_type(channel))
+        or not _is_left_out(channel, source, sources, is_stated, channels)
     ]
 
 
 def _is_left_out(
     channel: Channel, source: SourceConfig, sources: Sequence[SourceConfig], is_stated: bool, channels: Sequence[Channel]
 ) -> bool:
-    """Whether a channel of another type than the preset of `source`, whose topic means it, is not for that source.
+    """Whether a channel of another type than that of `source`, whose topic means it, is not for that source.
 
-    Topics of several types may fit one pattern, and one topic may have several types. A preset that the user states for another
+    Topics of several types may fit one pattern, and one topic may have several types. A type that the user states for another
     type is tried only where no channel is of its own type, and no other source is for the channel's.
     """
-    own = usable_preset(channel)
-    is_for_others = any(usable_preset(other) == source.preset and source.match(other.topic) is not None for other in channels)
-    return not is_stated or is_for_others or any(s.preset == own and s.match(channel.topic) is not None for s in sources)
+    own = usable_type(channel)
+    is_for_others = any(
+        usable_type(other) == source.message_type and source.match(other.topic) is not None for other in channels
+    )
+    return not is_stated or is_for_others or any(s.message_type == own and s.match(channel.topic) is not None for s in sources)
 
 
 def _meant(topic: str, channels: Sequence[Channel]) -> str:
@@ -148,18 +151,18 @@ def _named(suggested: SuggestedMapping, channels: Sequence[Channel]) -> list[Cha
 def _are_silent(suggested: SuggestedMapping, channels: Sequence[Channel]) -> bool:
     """Whether there are channels of detections, all of a known type, on which nothing was recorded."""
     named = _named(suggested, channels)
-    return bool(named) and all(usable_preset(channel) is not None for channel in named)
+    return bool(named) and all(usable_type(channel) is not None for channel in named)
 
 
 def _no_detections(suggested: SuggestedMapping, channels: Sequence[Channel]) -> str:
     """One line: what is there, and the lines that would make detections of it."""
     named = _named(suggested, channels)
-    unread = sorted({channel.topic for channel in named if usable_preset(channel) is None})
+    unread = sorted({channel.topic for channel in named if usable_type(channel) is None})
     if _are_silent(suggested, channels):
         return f"no message was recorded on {describe_channels(named)}; name other topics under [[extract.detections]]"
     if unread:
         paths = 'add [[extract.detections]] with topic, x = "path", y = "path" (or latitude, longitude)'
-        return f"no preset knows the schema of {', '.join(unread)}; {paths}; cadence info LOG prints the lines"
+        return f"the types of {', '.join(unread)} are not known; {paths}; cadence info LOG prints the lines"
     return f"nothing looks like detections among {describe_channels(channels)}; {_advice(suggested, channels)}"
 
 

@@ -10,7 +10,7 @@ from pipeline.extract.plausibility import Suspicions, few
 from pipeline.extract.positions import ChannelReader, Positions
 from pipeline.extract.selection import ROLES
 from pipeline.logs.reader import MissionLog
-from pipeline.mapping.presets import PRESETS, preset_for
+from pipeline.mapping.message_types import MESSAGE_TYPES, type_of_schema
 from pipeline.progress import Progress
 from pipeline.tables import Frame
 
@@ -99,7 +99,7 @@ def _unnamed(readers: Sequence[ChannelReader], detections: Positions) -> dict[st
     found = {}
     for reader in readers:
         if reader.role == "detections" and reader.channel.topic in topics:
-            preset = PRESETS.get(preset_for(reader.channel.schema_name) or "")
+            known = MESSAGE_TYPES.get(type_of_schema(reader.channel.schema_name) or "")
             is_read = "agent" in reader.fields
-            found[reader.channel.topic] = preset.agent[0] if preset is not None and preset.agent and not is_read else None
+            found[reader.channel.topic] = known.agent[0] if known is not None and known.agent and not is_read else None
     return found

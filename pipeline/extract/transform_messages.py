@@ -20,7 +20,7 @@ from pipeline.extract.transforms import Link, TransformTree, tree_of
 from pipeline.logs.decode import UndecodableChannel, UndecodableMessage, decoder_for
 from pipeline.logs.reader import Channel, MissionLog, RawMessage
 from pipeline.mapping.message_path import MissingFieldError, parse_path
-from pipeline.mapping.presets import normalise_schema
+from pipeline.mapping.message_types import normalise_schema
 from pipeline.progress import Progress
 
 STATIC_TOPIC = "tf_static"

@@ -13,7 +13,7 @@ from pipeline.mapping.message_path import MessagePath, MissingFieldError, Place,
 
 
 class Conditions:
-    """All of `texts` must hold. Of a preset's those count that a message has; what a user states must be there and hold."""
+    """All of `texts` must hold. Those of a known type count where a message has them; what a user states must hold."""
 
     def __init__(self, texts: Sequence[str], is_stated: bool) -> None:
         self.terms = tuple(term for text in texts for term in parse_conditions(text))

@@ -1,4 +1,4 @@
-"""Where a type that no preset knows may keep positions: paths to fields with the names of coordinates, out of its schema."""
+"""Where a type that is not known may keep positions: paths to fields with the names of coordinates, out of its schema."""
 
 import json
 from collections.abc import Iterator, Mapping

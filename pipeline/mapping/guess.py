@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, fields, replace
 from typing import Final, Literal
 
 from pipeline.mapping.field_paths import coordinate_paths
-from pipeline.mapping.presets import PRESETS, SETPOINTS, normalise_schema, preset_for
+from pipeline.mapping.message_types import MESSAGE_TYPES, SETPOINTS, normalise_schema, type_of_schema
 from pipeline.mapping.sources import ChannelLike, SourceConfig
 from pipeline.mapping.topic_names import DETECTION_WORDS, POSE_WORDS, TRUTH_WORDS, pattern_of, words_of
 
@@ -29,7 +29,7 @@ _TF_SCHEMAS = {"TFMessage", "tfMessage", "TransformStamped", "FrameTransform", "
 _OBSTACLE_SCHEMAS = {"OccupancyGrid", "Grid", "GeoJSON"}
 OWN_TOPICS = "/cadence/"
 """What an earlier run wrote into a combined file is never an input."""
-# Without a preset only a name as plain as this makes a detection: /radar/image or /battery/report are none.
+# Of a type that is not known only a name as plain as this makes a detection: /radar/image or /battery/report are none.
 _PLAIN_DETECTION = {"contact", "contacts", "detection", "detections", "target", "targets", "sighting", "sightings"}
 _DETECTION_TYPE = re.compile(r"Detection|Detected|Track(?!er)|Object|Contact|Targets|Sighting|Radar|BoundingBox|AIS|Ais|ADSB")
 _NEVER_POSITIONS = {"std_msgs", "sensor_msgs", "rcl_interfaces", "diagnostic_msgs", "visualization_msgs"}
@@ -37,9 +37,9 @@ _NEVER_POSITIONS = {"std_msgs", "sensor_msgs", "rcl_interfaces", "diagnostic_msg
 
 @dataclass(frozen=True)
 class SuggestedMapping:
-    """What the channels look like. `roles` maps topics to roles; the sources hold only channels with a preset.
+    """What the channels look like. `roles` maps topics to roles; the sources hold only channels of known types.
 
-    `unread` are detections of types that no preset knows, with paths that may fit; `unused` all topics that may hold
+    `unread` are detections of types that are not known, with paths that may fit; `unused` all topics that may hold
     detections and are in no source, and why they are not.
     """
 
@@ -59,21 +59,21 @@ class SuggestedMapping:
             blocks.append("# " + f"{comment}\n{_entry('detections', source)}".replace("\n", "\n# "))
         for source in self.unread:
             entry = _entry("detections", source)
-            blocks.append("# " + f"no preset knows its schema: give the paths of its fields\n{entry}".replace("\n", "\n# "))
+            blocks.append("# " + f"its type is not known: give the paths of its fields\n{entry}".replace("\n", "\n# "))
         if blocks and not self.detections:
             blocks.append("# to make sparse detections out of the dense channel:\n# [extract.thinning]\n# enabled = true")
         return "\n\n".join(blocks) + ("\n" if blocks else "")
 
 
 def suggest_mapping(channels: Sequence[ChannelLike]) -> SuggestedMapping:
-    """The roles that names and schemas suggest, and sources for the channels that have messages and a preset."""
+    """The roles that names and schemas suggest, and sources for the channels that have messages of known types."""
     roles = {channel.topic: role for channel in channels if (role := _role(channel)) is not None}
     doubtful = [topic for topic, role in roles.items() if role == "detections" and _may_be_setpoint(topic)]
     if len(doubtful) < sum(role == "detections" for role in roles.values()):
         roles = {topic: role for topic, role in roles.items() if topic not in doubtful}
 
     def readable(role: Role) -> list[ChannelLike]:
-        return [c for c in channels if roles.get(c.topic) == role and usable_preset(c) and c.message_count != 0]
+        return [c for c in channels if roles.get(c.topic) == role and usable_type(c) and c.message_count != 0]
 
     return SuggestedMapping(
         roles,
@@ -81,23 +81,23 @@ def suggest_mapping(channels: Sequence[ChannelLike]) -> SuggestedMapping:
         truth=_sources(readable("truth"), "truth"),
         poses=_sources(readable("poses"), "poses"),
         positions=_sources(readable("positions"), "positions"),
-        unread=tuple(_unread_source(c) for c in channels if roles.get(c.topic) == "detections" and not usable_preset(c)),
+        unread=tuple(_unread_source(c) for c in channels if roles.get(c.topic) == "detections" and not usable_type(c)),
         unused={c.topic: why for c in channels if c.message_count != 0 and (why := _why_unused(c, roles.get(c.topic)))},
     )
 
 
-def usable_preset(channel: ChannelLike) -> str | None:
-    """The name of the preset by which a channel can be read without being told; None where there is none."""
+def usable_type(channel: ChannelLike) -> str | None:
+    """The name of the known type by which a channel can be read without being told; None where there is none."""
     words = words_of(channel.topic)
-    name = preset_for(channel.schema_name) or ("AIS" if not channel.schema_name and "ais" in words else None)
-    if name is None or PRESETS[name].is_suggested or _ONLY_WITH.get(name, set()).intersection(words):
+    name = type_of_schema(channel.schema_name) or ("AIS" if not channel.schema_name and "ais" in words else None)
+    if name is None or MESSAGE_TYPES[name].is_suggested or _ONLY_WITH.get(name, set()).intersection(words):
         return name
     return None
 
 
 def dense_sources(channels: Sequence[ChannelLike], suggested: SuggestedMapping) -> tuple[SourceConfig, ...]:
     """Poses and positions as sources of truth, for a log whose only position channel is the one to thin."""
-    usable = [c for c in channels if suggested.roles.get(c.topic) in ("poses", "positions") and usable_preset(c)]
+    usable = [c for c in channels if suggested.roles.get(c.topic) in ("poses", "positions") and usable_type(c)]
     return _sources([c for c in usable if c.message_count != 0], "truth")
 
 
@@ -111,24 +111,24 @@ def describe_channels(channels: Iterable[ChannelLike]) -> str:
 def _role(channel: ChannelLike) -> Role | None:
     """Schema first, then the words of the name; truth before detection, detection before pose (`/truth/target/pose`)."""
     package, _, kind = normalise_schema(channel.schema_name).rpartition(".")
-    words, preset = words_of(channel.topic), usable_preset(channel)
-    if kind in _TF_SCHEMAS and preset is None:
+    words, known = words_of(channel.topic), usable_type(channel)
+    if kind in _TF_SCHEMAS and known is None:
         return "tf"
-    if (kind in _OBSTACLE_SCHEMAS and preset is None) or (preset == "SceneUpdate" and _OBSTACLE.intersection(words)):
+    if (kind in _OBSTACLE_SCHEMAS and known is None) or (known == "SceneUpdate" and _OBSTACLE.intersection(words)):
         return "obstacles"
     if channel.topic.startswith(OWN_TOPICS) or _is_setpoint(channel):
         return None
-    if preset is None:
-        if preset_for(channel.schema_name) is not None or package in _NEVER_POSITIONS:
+    if known is None:
+        if type_of_schema(channel.schema_name) is not None or package in _NEVER_POSITIONS:
             return None  # only when told
         if _PLAIN_DETECTION.intersection(words):
             return "detections"
         return "obstacles" if _OBSTACLE.intersection(words) else None
     if TRUTH_WORDS.intersection(words) or ("ground", "truth") in itertools.pairwise(words):
         return "truth"
-    if PRESETS[preset].role is not None or DETECTION_WORDS.intersection(words):
-        return PRESETS[preset].role or "detections"
-    if preset == "SceneUpdate":
+    if MESSAGE_TYPES[known].role is not None or DETECTION_WORDS.intersection(words):
+        return MESSAGE_TYPES[known].role or "detections"
+    if known == "SceneUpdate":
         return None  # a scene without such a name may show anything
     return "poses" if POSE_WORDS.intersection(words) else "positions"
 
@@ -149,17 +149,17 @@ def _why_unused(channel: ChannelLike, role: Role | None) -> str | None:
     has_name, has_type = not _PLAIN_DETECTION.isdisjoint(words_of(channel.topic)), _DETECTION_TYPE.search(kind) is not None
     if role not in (None, "detections") or channel.topic.startswith(OWN_TOPICS) or not (has_name or has_type):
         return None
-    if usable_preset(channel) is not None and role == "detections":
+    if usable_type(channel) is not None and role == "detections":
         return None
     if _is_setpoint(channel) or _may_be_setpoint(channel.topic):
         return "it may be where a vehicle is told to go"
-    if preset_for(channel.schema_name) is not None:
+    if type_of_schema(channel.schema_name) is not None:
         return "what is drawn may be anything"
-    return "no preset knows its type"
+    return "its type is not known"
 
 
 def _unread_source(channel: ChannelLike) -> SourceConfig:
-    """An entry for a channel of a type that no preset knows, with paths out of its schema where it has any that fit."""
+    """An entry for a channel of a type that is not known, with paths out of its schema where it has any that fit."""
     first, second = coordinate_paths(channel.schema_name, channel.schema_data) or ("position.x", "position.y")
     if first.rpartition(".")[2].startswith("lat"):
         return SourceConfig(channel.topic, latitude=first, longitude=second)
@@ -168,10 +168,10 @@ def _unread_source(channel: ChannelLike) -> SourceConfig:
 
 
 def _sources(channels: Sequence[ChannelLike], role: Role) -> tuple[SourceConfig, ...]:
-    """One source a pattern: topics of one preset that differ only in a name share it."""
+    """One source a pattern: topics of one type that differ only in a name share it."""
     topics = [channel.topic for channel in channels]
-    found = {(pattern_of(c.topic, role, not _holds_several(c), topics), usable_preset(c)): None for c in channels}
-    return tuple(SourceConfig(pattern, preset=preset) for pattern, preset in found)
+    found = {(pattern_of(c.topic, role, not _holds_several(c), topics), usable_type(c)): None for c in channels}
+    return tuple(SourceConfig(pattern, message_type=known) for pattern, known in found)
 
 
 def _name_only_agent(
@@ -193,13 +193,13 @@ def _name_only_agent(
 
 def _holds_several(channel: ChannelLike) -> bool:
     """Whether the name of the topic cannot be that of who was seen: messages name agents, or hold several."""
-    preset = usable_preset(channel)
-    return preset is not None and (PRESETS[preset].names_agents or PRESETS[preset].is_array)
+    known = usable_type(channel)
+    return known is not None and (MESSAGE_TYPES[known].names_agents or MESSAGE_TYPES[known].is_array)
 
 
 def _names_agents(channel: ChannelLike) -> bool:
-    preset = usable_preset(channel)
-    return preset is not None and PRESETS[preset].names_agents
+    known = usable_type(channel)
+    return known is not None and MESSAGE_TYPES[known].names_agents
 
 
 def _entry(role: str, source: SourceConfig) -> str:

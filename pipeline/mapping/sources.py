@@ -8,15 +8,15 @@ from typing import Any, Literal, Protocol
 from cadence.errors import ConfigError
 from pipeline.mapping.conditions import parse_conditions
 from pipeline.mapping.message_path import parse_path
-from pipeline.mapping.preset import PATHS, Preset
-from pipeline.mapping.presets import PRESETS, preset_for
+from pipeline.mapping.message_type import PATHS, MessageType
+from pipeline.mapping.message_types import MESSAGE_TYPES, type_of_schema
 
 PLACEHOLDERS = ("agent", "sensor")
 LOG_TIME = "log_time"
 PUBLISH_TIME = "publish_time"
 
 PATH_KEYS = {"agent": "agent_path", "sensor": "sensor_path"}
-"""The keys of a source that state a message path under another name than the preset's field; all others are named alike."""
+"""The keys of a source that state a message path under another name than the type's field; all others are named alike."""
 
 _CHECKED = (
     "agent_path", "sensor_path", "x", "y", "z", "latitude", "longitude", "altitude", "covariance", "sigma", "score", "time",
@@ -46,7 +46,7 @@ class SourceConfig:
     """One `[[extract.detections]]`, `[[extract.truth]]` or `[[extract.poses]]` entry.
 
     topic       exact, or with `{agent}` and/or `{sensor}` in place of a part of a name (`/truth/{agent}`)
-    preset      a name of `pipeline.mapping.presets`; without one and without paths it is chosen by the schema
+    message_type  a name of `pipeline.mapping.message_types`; without one and without paths it is chosen by the schema
     agent, agent_path    who was seen: a constant, or a message path; neither (nor `{agent}`) means origin unknown
     has_identity   whether messages and topics say who was seen; true: believed as it stands, false: never; default: judged by
                    whether it can be meant
@@ -55,21 +55,21 @@ class SourceConfig:
     latitude, longitude, altitude   message paths of a position in degrees (and metres), instead of x, y and z
     unit        of latitude and longitude: "deg", "rad" or "1e-7 deg"; of x, y and z: "m" (of a plane) or "ecef" (from
                 the earth's centre); default: degrees or metres, but for what can hardly be meant as such
-    where       conditions on fields of the message, all of which must hold: "fix_type >= 3 && lat_lon_valid"; the preset's are
+    where       conditions on fields of the message, all of which must hold: "fix_type >= 3 && lat_lon_valid"; the type's are
                 used where nothing is stated, and "" means none
     covariance  message path of 1, 4, 9 or 36 numbers (a variance, or rows of a matrix), 6 or 21 (an upper triangle) or 3 (a
-                diagonal), x first, m²; where it is stated, what a preset reads of its type does not count
+                diagonal), x first, m²; where it is stated, what is read of a known type does not count
     sigma       message path of a standard deviation of x and y, in metres, where the message states no covariance
     sigma_m     standard deviation of x and y where the message states neither
     score       message path of a confidence
     time        message path of a stamp, or "log_time" or "publish_time"; default: the header's stamp, else the log time
     frame_id    message path of the frame's name; default: the header's
     frame_convention   axes of x, y and z, after transforms: "enu" (east, north, up) or "ned" (north, east, down); default: the
-                       preset's, which is "enu" but for PX4's types
+                       type's, which is "enu" but for PX4's types
     """
 
     topic: str
-    preset: str | None = None
+    message_type: str | None = None
     agent: str | None = None
     agent_path: str | None = None
     has_identity: bool | None = None
@@ -92,8 +92,8 @@ class SourceConfig:
     frame_convention: Literal["enu", "ned"] | None = None
 
     def __post_init__(self) -> None:
-        if self.preset is not None and self.preset not in PRESETS:
-            raise ValueError(f"preset {self.preset!r} is not known; known: {', '.join(PRESETS)}")
+        if self.message_type is not None and self.message_type not in MESSAGE_TYPES:
+            raise ValueError(f"message_type {self.message_type!r} is not known; known: {', '.join(MESSAGE_TYPES)}")
         for name in _CHECKED:
             text = getattr(self, name)
             if text is not None and text not in (LOG_TIME, PUBLISH_TIME):
@@ -133,23 +133,23 @@ class SourceConfig:
         return None if found is None else found.groupdict()
 
 
-def resolve_paths(source: SourceConfig, schema_name: str) -> Preset:
-    """The message paths for a schema: what the source states over its preset; `ConfigError` where there is no position."""
+def resolve_paths(source: SourceConfig, schema_name: str) -> MessageType:
+    """The message paths for a schema: what the source states over its type; `ConfigError` where there is no position."""
     is_custom = source.x is not None or source.latitude is not None
-    name = source.preset if source.preset is not None or is_custom else preset_for(schema_name)
+    name = source.message_type if source.message_type is not None or is_custom else type_of_schema(schema_name)
     if name is None and not is_custom:
         raise ConfigError(
-            f"topic {source.topic}: no preset for the schema {schema_name or '(none)'}; "
+            f"topic {source.topic}: its type, {schema_name or 'without a schema'}, is not known; "
             "give message paths in its [extract] entry: x and y, or latitude and longitude"
         )
-    base = PRESETS[name] if name is not None else Preset(())
-    if is_custom:  # another position must not take height or covariance from the preset's
-        base = Preset(
+    base = MESSAGE_TYPES[name] if name is not None else MessageType(())
+    if is_custom:  # another position must not take height or covariance from the type's
+        base = MessageType(
             (), time=base.time, frame_id=base.frame_id, agent=base.agent, sensor=base.sensor, score=base.score,
             where=base.where, json_text=base.json_text,
         )  # fmt: skip
     stated: dict[str, Any] = {}
-    for item in fields(Preset):
+    for item in fields(MessageType):
         value = getattr(source, PATH_KEYS.get(item.name, item.name), None)
         if value is not None:
             stated[item.name] = (source.without_topic(value),) if item.name in PATHS else value

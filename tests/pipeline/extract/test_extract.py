@@ -258,7 +258,7 @@ def test_thinning_the_only_dense_channel(tmp_path: Path) -> None:
     again = run(tmp_path, DENSE, thinning=thinning)
     assert again.detections.equals(found.detections)
     assert not run(tmp_path, DENSE, thinning={**thinning, "seed": 1}).detections.equals(found.detections)
-    pasted = {"poses": [{"topic": "/{sensor}/pose", "preset": "PoseInFrame"}]}  # as cadence info suggests
+    pasted = {"poses": [{"topic": "/{sensor}/pose", "message_type": "PoseInFrame"}]}  # as cadence info suggests
     assert run(tmp_path, DENSE, thinning=thinning, **pasted).detections.equals(found.detections)
     alone = run(tmp_path, [row for row in DENSE if row.topic == "/cub1/pose"], thinning=thinning)
     of_cub1 = found.detections.filter(pc.equal(found.detections["agent_id"], "cub1"))
@@ -318,7 +318,7 @@ def test_nothing_to_detect(tmp_path: Path) -> None:
     match = r"/imu \(sensor_msgs/Imu\); if one holds them, add \[\[extract\.detections"
     fails(mk(tmp_path / "b"), [Row("/imu", "sensor_msgs/Imu", 1.0, {})], InputError, match)
     assert "no message was recorded" in _no_detections(suggest_mapping([EMPTY]), [EMPTY])
-    fails(mk(tmp_path / "c"), [Row("/detections", "my.Own", 1.0, {})], InputError, "no preset knows the schema of /detections")
+    fails(mk(tmp_path / "c"), [Row("/detections", "my.Own", 1.0, {})], InputError, "the types of /detections are not known")
 
 
 def test_truth_is_never_advised_as_detections(tmp_path: Path) -> None:
@@ -343,7 +343,7 @@ def test_wrong_configuration(tmp_path: Path) -> None:
     fails(mk(tmp_path / "b"), line(), ConfigError, "no field 'why'; fields there: x, y, z", detections=[entry])
     entry = {"topic": "/detections", "agent_path": "name"}
     fails(mk(tmp_path / "c"), line(), ConfigError, "no field 'name'", detections=[entry])
-    entry = {"topic": "/detections", "preset": "LocationFix"}
+    entry = {"topic": "/detections", "message_type": "LocationFix"}
     fails(mk(tmp_path / "d"), line(), ConfigError, "no field 'latitude'", detections=[entry])
     fails(mk(tmp_path / "e"), line(), ConfigError, "datum", datum=[91.0, 0.0])
     fails(mk(tmp_path / "f"), line(), ConfigError, r"extract\.thinning: unknown key 'gap'", thinning={"gap": 1})

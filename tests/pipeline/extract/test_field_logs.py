@@ -20,7 +20,7 @@ def pose_row(time_s: float, x: float, topic: str, frame: str = "map") -> Row:
 
 
 def test_topics_of_several_types_in_one_pattern(tmp_path: Path) -> None:
-    """Each is read by its own type's preset, although the patterns of both fit both."""
+    """Each is read by its own type, although the patterns of both fit both."""
     rows = []
     for i in range(4):
         header = SEEN.header("map", time_ns(i))
@@ -40,7 +40,7 @@ def test_one_topic_with_two_types_is_never_mixed(tmp_path: Path) -> None:
     (tmp_path / "both").mkdir()
     rows = [fix(float(i), 50.0, 1.0 + i * 1e-4, "/target/position") for i in range(6)]
     rows += [pose(6.0 + i, 10.0 * i, 0.0, "/target/position") for i in range(6)]
-    found = run(tmp_path, rows, detections=[{"topic": "/target/position", "preset": "NavSatFix"}])
+    found = run(tmp_path, rows, detections=[{"topic": "/target/position", "message_type": "NavSatFix"}])
     assert found.summary["num_detections"] == 6 and found.frame.is_georeferenced
     assert found.summary["unused"] == {"/target/position (foxglove.PoseInFrame)": "[[extract.detections]] names others"}
     fails(tmp_path / "both", rows, InputError, r"frames: /target/position \(latitude and longitude\), /target/position")
@@ -131,8 +131,8 @@ def test_channels_that_may_hold_detections_are_named(tmp_path: Path) -> None:
     rows += [ROS.cdr_row(ROS("visualization_msgs/msg/MarkerArray"), "/viz/targets"), Row("/wheel", "own.Speed", 1.0, {})]
     found = run(tmp_path, rows)
     assert found.summary["unused"] == {
-        "/lidar/objects (own.ObstacleDetections)": "no preset knows its type",
-        "/fused (own_msgs/msg/TrackedObjectList)": "no preset knows its type",
+        "/lidar/objects (own.ObstacleDetections)": "its type is not known",
+        "/fused (own_msgs/msg/TrackedObjectList)": "its type is not known",
         "/viz/targets (visualization_msgs/msg/MarkerArray)": "what is drawn may be anything",
     }
     stated = run(tmp_path, [*rows, pose_row(9.0, 1.0, "/more/contacts/b")], detections=[{"topic": "/contacts/{agent}"}])

@@ -209,7 +209,7 @@ def test_stated_paths(source: dict[str, str], tmp_path: Path, monkeypatch: pytes
         ('header.frame_id == "gps"', [50.0, 51.0, 52.0, 53.0, 54.0]),
         ("latitude > 52.5", [53.0, 54.0]),
         ("position_covariance_type == COVARIANCE_TYPE_KNOWN", []),
-        ("", [50.0, 51.0, 52.0, 53.0, 54.0]),  # not even the preset's
+        ("", [50.0, 51.0, 52.0, 53.0, 54.0]),  # not even the type's
     ],
 )
 def test_conditions(where: str, expected: list[float], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -217,7 +217,7 @@ def test_conditions(where: str, expected: list[float], tmp_path: Path, monkeypat
     log = open_log(write(tmp_path / "a.mcap", FIX, messages))
     (rows, _), counts = assert_same(log, monkeypatch, where=where)
     assert rows.first.tolist() == expected and counts["unmet"] == 5 - len(expected)
-    assert counts["no_fix"] == 2  # of the other reader, which has the preset's
+    assert counts["no_fix"] == 2  # of the other reader, which has the type's
 
 
 def test_standard_deviations(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

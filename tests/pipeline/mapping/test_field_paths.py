@@ -1,4 +1,4 @@
-"""Where a type that no preset knows may keep positions."""
+"""Where a type that is not known may keep positions."""
 
 import json
 

@@ -74,9 +74,9 @@ def test_roles() -> None:
 
 def test_topics_of_one_pattern_become_one_source() -> None:
     found = suggest(("/truth/A", FIX), ("/truth/B", FIX), ("/contacts/A", FIX), ("/trackers/7", FIX))
-    assert found.truth == (SourceConfig("/truth/{agent}", preset="LocationFix"),)
-    assert found.detections == (SourceConfig("/contacts/{agent}", preset="LocationFix"),)
-    assert found.poses == (SourceConfig("/trackers/{sensor}", preset="LocationFix"),)
+    assert found.truth == (SourceConfig("/truth/{agent}", message_type="LocationFix"),)
+    assert found.detections == (SourceConfig("/contacts/{agent}", message_type="LocationFix"),)
+    assert found.poses == (SourceConfig("/trackers/{sensor}", message_type="LocationFix"),)
 
 
 @pytest.mark.parametrize(
@@ -174,7 +174,7 @@ def test_patterns(pattern: str, topic: str, expected: dict[str, str] | None) -> 
         ({"topic": "/a", "x": "/b.p.x", "y": "p.y"}, "leave the topic out"),
         ({"topic": "/a", "frame_convention": "NED"}, "'NED' is not one of enu, ned"),
         ({"topic": "/a", "x": "p.x", "y": "p[.y"}, r"y: message path 'p\[.y'"),
-        ({"topic": "/a", "preset": "Places"}, "preset 'Places' is not known"),
+        ({"topic": "/a", "message_type": "Places"}, "message_type 'Places' is not known"),
         ({"topic": "/a", "where": "fix_type => 3"}, "where: condition 'fix_type => 3': expected terms such as"),
         ({"topic": "/a", "sigma_m": 0.0}, "sigma_m"),
     ],
@@ -185,13 +185,13 @@ def test_wrong_sources(table: dict[str, object], message: str) -> None:
     assert str(caught.value).startswith("extract.detections[0]") and "\n" not in str(caught.value)
 
 
-def test_stated_paths_replace_those_of_the_preset() -> None:
+def test_stated_paths_replace_those_of_the_type() -> None:
     paths = resolve_paths(SourceConfig("/a", covariance="cov", agent_path="id"), "foxglove.LocationFix")
     assert (paths.latitude, paths.covariance, paths.agent) == (("latitude",), ("cov",), ("id",))
 
 
-def test_a_stated_position_takes_nothing_of_the_presets_geometry() -> None:
-    paths = resolve_paths(SourceConfig("/a", preset="LocationFix", x="p.x", y="p.y"), "foxglove.LocationFix")
+def test_a_stated_position_takes_nothing_of_the_types_geometry() -> None:
+    paths = resolve_paths(SourceConfig("/a", message_type="LocationFix", x="p.x", y="p.y"), "foxglove.LocationFix")
     assert (paths.x, paths.latitude, paths.covariance, paths.altitude) == (("p.x",), (), (), ())
     assert "timestamp" in paths.time
 
@@ -204,6 +204,6 @@ def test_paths_may_hold_their_topic_as_in_foxglove() -> None:
     assert paths.score == ("{ok==true}.score",)
 
 
-def test_no_preset_and_no_paths() -> None:
-    with pytest.raises(ConfigError, match=r"no preset for the schema my.Own; give message paths"):
+def test_no_known_type_and_no_paths() -> None:
+    with pytest.raises(ConfigError, match=r"its type, my.Own, is not known; give message paths"):
         resolve_paths(SourceConfig("/a"), "my.Own")

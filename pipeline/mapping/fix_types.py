@@ -1,4 +1,4 @@
-"""Presets of positions in latitude and longitude: receivers and autopilots, ships (AIS), aircraft (ADS-B), GeoJSON.
+"""Message types of positions in latitude and longitude: receivers and autopilots, ships (AIS), aircraft (ADS-B), GeoJSON.
 
 Receivers that state integers have them in 1e-7 degrees and millimetres.
 """
@@ -6,7 +6,7 @@ Receivers that state integers have them in 1e-7 degrees and millimetres.
 from dataclasses import replace
 from typing import Final
 
-from pipeline.mapping.preset import FRAME_PATHS, TIME_PATHS, Preset, geodetic
+from pipeline.mapping.message_type import FRAME_PATHS, TIME_PATHS, MessageType, geodetic
 
 _NOT_SHIPS = (4, 21)
 """AIS messages of base stations and of aids to navigation."""
@@ -14,7 +14,7 @@ _FEATURES = 'features[:]{geometry.type=="Point"}'
 _POINTS = (f"{_FEATURES}.geometry.coordinates", '{geometry.type=="Point"}.geometry.coordinates')
 
 
-FIXES: Final[dict[str, Preset]] = {
+FIXES: Final[dict[str, MessageType]] = {
     "NavSatFix": replace(geodetic("sensor_msgs.NavSatFix"), where=("status.status >= 0",)),
     "GPSFix": replace(
         geodetic("gps_msgs.GPSFix"), schemas=("gps_msgs.GPSFix", "gps_common.GPSFix"), where=("status.status >= 0",)
@@ -33,7 +33,7 @@ FIXES: Final[dict[str, Preset]] = {
         covariance_type=(),
         is_north_first=True,
     ),
-    "NavPVT": Preset(
+    "NavPVT": MessageType(
         ("ublox_msgs.NavPVT", "ublox_msgs.NavPVT7"),
         latitude=("lat.@div(1e7)",),
         longitude=("lon.@div(1e7)",),
@@ -41,7 +41,7 @@ FIXES: Final[dict[str, Preset]] = {
         sigma=("h_acc.@div(1000)", "hAcc.@div(1000)"),
         where=("flags & 1", "fix_type != 0", "fix_type != 5", "fixType != 0", "fixType != 5"),
     ),
-    "GPSRAW": Preset(
+    "GPSRAW": MessageType(
         ("mavros_msgs.GPSRAW",),
         latitude=("lat.@div(1e7)",),
         longitude=("lon.@div(1e7)",),
@@ -49,7 +49,7 @@ FIXES: Final[dict[str, Preset]] = {
         sigma=("h_acc.@div(1000)",),
         where=("fix_type >= 2",),
     ),
-    "BESTPOS": Preset(
+    "BESTPOS": MessageType(
         ("novatel_oem7_msgs.BESTPOS",),
         latitude=("lat",),
         longitude=("lon",),
@@ -60,7 +60,7 @@ FIXES: Final[dict[str, Preset]] = {
     "SbgGpsPos": replace(
         geodetic("sbg_driver.SbgGpsPos"), covariance=(), sigma=("position_accuracy.x",), where=("status.status == 0",)
     ),
-    "VehicleGlobalPosition": Preset(
+    "VehicleGlobalPosition": MessageType(
         ("px4_msgs.VehicleGlobalPosition", "px4_msgs.VehicleGlobalPositionGroundtruth"),
         latitude=("lat",),
         longitude=("lon",),
@@ -68,7 +68,7 @@ FIXES: Final[dict[str, Preset]] = {
         sigma=("eph",),
         where=("lat_lon_valid",),
     ),
-    "SensorGps": Preset(
+    "SensorGps": MessageType(
         ("px4_msgs.SensorGps", "px4_msgs.VehicleGpsPosition"),
         latitude=("latitude_deg", "lat.@div(1e7)"),
         longitude=("longitude_deg", "lon.@div(1e7)"),
@@ -77,7 +77,7 @@ FIXES: Final[dict[str, Preset]] = {
         where=("fix_type >= 2",),
         time=("time_utc_usec", *TIME_PATHS),
     ),
-    "TransponderReport": Preset(
+    "TransponderReport": MessageType(
         ("px4_msgs.TransponderReport",),
         latitude=("lat",),
         longitude=("lon",),
@@ -87,7 +87,7 @@ FIXES: Final[dict[str, Preset]] = {
         role="detections",
         names_agents=True,
     ),
-    "ADSBVehicle": Preset(
+    "ADSBVehicle": MessageType(
         ("mavros_msgs.ADSBVehicle",),
         latitude=("latitude",),
         longitude=("longitude",),
@@ -108,7 +108,7 @@ FIXES: Final[dict[str, Preset]] = {
         names_agents=True,
     ),
     # JSON of AIS decoders, which has no schema: gpsd and AIS-catcher (type), pyais (msg_type), aisstream (MetaData).
-    "AIS": Preset(
+    "AIS": MessageType(
         (),
         latitude=("lat", "latitude", "MetaData.latitude"),
         longitude=("lon", "longitude", "MetaData.longitude"),
@@ -118,7 +118,7 @@ FIXES: Final[dict[str, Preset]] = {
         role="detections",
         names_agents=True,
     ),
-    "GeoJSON": Preset(
+    "GeoJSON": MessageType(
         ("foxglove.GeoJSON",),
         latitude=tuple(f"{point}[1]" for point in _POINTS),
         longitude=tuple(f"{point}[0]" for point in _POINTS),

@@ -1,4 +1,4 @@
-"""Presets of what vehicles, receivers and detectors record, against messages built with the definitions of their packages."""
+"""Types of what vehicles, receivers and detectors record, against messages built with the definitions of their packages."""
 
 import json
 from pathlib import Path
@@ -13,7 +13,7 @@ from fixtures.small_logs import START_NS, Row, write_log
 from pipeline.extract.positions import ChannelReader, Positions
 from pipeline.extract.reading import read_positions
 from pipeline.logs.reader import open_log
-from pipeline.mapping.presets import preset_for
+from pipeline.mapping.message_types import type_of_schema
 from pipeline.mapping.sources import SourceConfig
 from pipeline.progress import Progress
 
@@ -47,7 +47,7 @@ def status(kind: str, value: int) -> Any:
 
 HEAD = {"header": FIXES.header()}
 E7 = {"lat": 505_000_000, "lon": -12_500_000}
-GEODETIC = {  # preset: a valid message, an invalid one, the standard deviation that it states
+GEODETIC = {  # type: a valid message, an invalid one, the standard deviation that it states
     "GPSFix": (
         FIXES(
             "gps_msgs/msg/GPSFix", **HEAD, status=status("gps_msgs/msg/GPSStatus", 0), latitude=50.5, longitude=-1.25,
@@ -107,7 +107,7 @@ GEODETIC = {  # preset: a valid message, an invalid one, the standard deviation 
 def test_fixes(tmp_path: Path, name: str) -> None:
     valid, invalid, sigma_m = GEODETIC[name]
     rows, reader = read_ros(tmp_path, NED if "px4" in valid.__msgtype__ else FIXES, valid, invalid)
-    assert preset_for(valid.__msgtype__) == name and reader.counts["no_fix"] == 1
+    assert type_of_schema(valid.__msgtype__) == name and reader.counts["no_fix"] == 1
     assert (rows.first.tolist(), rows.second.tolist(), rows.z_m.tolist()) == ([50.5], [-1.25], [7.0])
     assert rows.is_geodetic.all() and rows.agent[0] == ("7" if name == "TransponderReport" else None)
     np.testing.assert_array_equal(rows.covariance_m2[0], [np.nan] * 3 if sigma_m is None else [sigma_m**2, 0, sigma_m**2])
@@ -156,7 +156,7 @@ def test_ais_stations_ashore_are_no_ships(tmp_path: Path) -> None:
 )
 def test_json_of_ais_decoders(tmp_path: Path, message: dict[str, Any], expected: list[tuple[str, float]]) -> None:
     other = {"mmsi": 1, "lat": 50.0, "lon": -1.25}
-    rows, _ = read(tmp_path, [Row("/ais", "", 2.0, message), Row("/ais", "", 3.0, other)], preset="AIS")
+    rows, _ = read(tmp_path, [Row("/ais", "", 2.0, message), Row("/ais", "", 3.0, other)], message_type="AIS")
     assert list(zip(rows.agent, rows.first, strict=True)) == [*expected, ("1", 50.0)] and set(rows.second) == {-1.25}
     if "time" in message:
         assert rows.time_ns[0] == START_NS + 5 * 10**9
@@ -207,7 +207,7 @@ def pose_with(kind: str, **values: Any) -> Any:
 
 SPATIAL = SEEN("depthai_ros_msgs/msg/SpatialDetection", position=SEEN.point(), is_tracking=True, tracking_id="7")
 PLACE = np.array([1.5, -2.5, 3.5], np.float32)
-ARRAYS: dict[str, tuple[str, Any, dict[str, Any]]] = {  # preset: field of the array, an item, what else is expected
+ARRAYS: dict[str, tuple[str, Any, dict[str, Any]]] = {  # type: field of the array, an item, what else is expected
     "ObjectArray": ("objects", pose_with("derived_object_msgs/msg/Object", id=7), {}),
     "ObjectsStamped": (
         "objects",
@@ -242,7 +242,7 @@ def test_objects(tmp_path: Path, name: str) -> None:
     field, item, more = ARRAYS[name]
     package = item.__msgtype__.rsplit("/", 1)[0]
     rows, _ = read_ros(tmp_path, SEEN, SEEN(f"{package}/{name}", header=SEEN.header(), **{field: [item, item]}))
-    assert preset_for(f"{package}/{name}") == name
+    assert type_of_schema(f"{package}/{name}") == name
     assert (rows.first.tolist(), rows.second.tolist(), rows.z_m.tolist()) == ([1.5] * 2, [-2.5] * 2, [3.5] * 2)
     assert rows.agent.tolist() == [more.get("agent", "7")] * 2 and rows.frame_id.tolist() == ["odom"] * 2
     assert rows.time_ns.tolist() == [START_NS + 250_000_000] * 2 and not rows.is_geodetic.any()

@@ -1,14 +1,14 @@
-"""Presets of positions in metres: ROS, Foxglove, PX4, motion capture, and what viewers are given to draw."""
+"""Message types of positions in metres: ROS, Foxglove, PX4, motion capture, and what viewers are given to draw."""
 
 from dataclasses import replace
 from typing import Final
 
-from pipeline.mapping.preset import FRAME_PATHS, TIME_PATHS, Preset, metric, stamped_items
+from pipeline.mapping.message_type import FRAME_PATHS, TIME_PATHS, MessageType, metric, stamped_items
 
 _TRANSFORM = "transform.translation"
 _MARKERS = "markers[:]"
 
-POSES: Final[dict[str, Preset]] = {
+POSES: Final[dict[str, MessageType]] = {
     "PointStamped": metric("geometry_msgs.PointStamped", "point"),
     "PoseStamped": metric("geometry_msgs.PoseStamped", "pose.position"),
     "PoseWithCovarianceStamped": replace(
@@ -37,7 +37,7 @@ POSES: Final[dict[str, Preset]] = {
         frame_convention="ned",
     ),
     # The position was three fields before it was an array; its covariance an upper triangle before it was a diagonal.
-    "VehicleOdometry": Preset(
+    "VehicleOdometry": MessageType(
         ("px4_msgs.VehicleOdometry", "px4_msgs.VehicleVisualOdometry", "px4_msgs.VehicleMocapOdometry"),
         x=("position[0]", "x"),
         y=("position[1]", "y"),

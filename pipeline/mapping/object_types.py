@@ -1,22 +1,22 @@
-"""Presets of what detectors and trackers say of many objects at once."""
+"""Message types of what detectors and trackers say of many objects at once."""
 
 from dataclasses import replace
 from typing import Final
 
-from pipeline.mapping.preset import FRAME_PATHS, Preset, metric, stamped_items
+from pipeline.mapping.message_type import FRAME_PATHS, MessageType, metric, stamped_items
 
 _RESULT = "results[0]"
 _KINEMATICS = "objects[:].kinematics"
 
 
-def _vision(schema: str, item: str) -> Preset:
+def _vision(schema: str, item: str) -> MessageType:
     """vision_msgs' detections: the box is filled in, or only the pose of the best hypothesis.
 
     Foxy and ROS 1 have the score beside that pose.
     """
-    preset = metric(schema, f"{item}bbox.center.position", f"{item}{_RESULT}.pose.pose.position")
+    known = metric(schema, f"{item}bbox.center.position", f"{item}{_RESULT}.pose.pose.position")
     return replace(
-        stamped_items(preset, item) if item else preset,
+        stamped_items(known, item) if item else known,
         alternatives="filled",
         covariance=(f"{item}{_RESULT}.pose.covariance",),
         agent=(f"{item}id", f"{item}tracking_id"),
@@ -26,7 +26,7 @@ def _vision(schema: str, item: str) -> Preset:
     )
 
 
-OBJECTS: Final[dict[str, Preset]] = {
+OBJECTS: Final[dict[str, MessageType]] = {
     "Detection3DArray": _vision("vision_msgs.Detection3DArray", "detections[:]."),
     "Detection3D": _vision("vision_msgs.Detection3D", ""),
     "RadarTracks": replace(
@@ -88,7 +88,7 @@ OBJECTS: Final[dict[str, Preset]] = {
         names_agents=True,
     ),
     # label_id is the tracker's identity, label the class. States 2 and 3 are searched for: their place is a guess.
-    "ObjectsStamped": Preset(
+    "ObjectsStamped": MessageType(
         ("zed_msgs.ObjectsStamped", "zed_interfaces.ObjectsStamped"),
         x=("objects[:].position[0]",),
         y=("objects[:].position[1]",),

@@ -1,4 +1,4 @@
-"""Every preset against messages built with the real definitions of their types, through the log, in every encoding."""
+"""Every known type against messages built with the real definitions of their types, through the log, in every encoding."""
 
 import json
 from collections.abc import Callable
@@ -32,7 +32,7 @@ from rosbags.typesys import Stores
 from pipeline.extract.positions import ChannelReader, Positions
 from pipeline.extract.reading import read_positions
 from pipeline.logs.reader import open_log
-from pipeline.mapping.presets import PRESETS, normalise_schema, preset_for
+from pipeline.mapping.message_types import MESSAGE_TYPES, normalise_schema, type_of_schema
 from pipeline.mapping.sources import SourceConfig
 from pipeline.progress import Progress
 
@@ -102,7 +102,7 @@ def test_common_ros_messages(tmp_path: Path, name: str, encoding: str) -> None:
     build = NOETIC if encoding == "ros1" else ROS
     message = COMMON[name](build)
     rows, _ = read(tmp_path, [encoded(build, message, encoding)])
-    assert preset_for(message.__msgtype__) == name
+    assert type_of_schema(message.__msgtype__) == name
     assert len(rows) == (2 if name == "PoseArray" else 1)
     assert rows.time_ns[0] == START_NS + 250_000_000
     assert rows.log_time_ns[0] == START_NS + 10**9
@@ -289,11 +289,11 @@ def test_empty_array_is_no_detection_and_no_fault(tmp_path: Path) -> None:
     ],
 )
 def test_schema_names(name: str | None, expected: str | None) -> None:
-    assert preset_for(name) == expected
+    assert type_of_schema(name) == expected
 
 
-def test_presets_are_complete() -> None:
-    for name, preset in PRESETS.items():
-        assert all(normalise_schema(schema) == schema for schema in preset.schemas), name
-        assert preset.schemas or name == "AIS"  # JSON without a schema
-        assert bool(preset.x) != bool(preset.latitude), name
+def test_types_are_complete() -> None:
+    for name, known in MESSAGE_TYPES.items():
+        assert all(normalise_schema(schema) == schema for schema in known.schemas), name
+        assert known.schemas or name == "AIS"  # JSON without a schema
+        assert bool(known.x) != bool(known.latitude), name

@@ -1,4 +1,4 @@
-"""A preset: where messages of one type keep position, time, covariance and identity, and which of them are to be believed."""
+"""A known message type: where it keeps position, time, covariance and identity, and which of them are to be believed."""
 
 from dataclasses import dataclass, replace
 from typing import Final, Literal
@@ -13,11 +13,11 @@ PATHS: Final = (
     "x", "y", "z", "latitude", "longitude", "altitude", "covariance", "covariance_type", "sigma", "time", "frame_id", "agent",
     "sensor", "score",
 )  # fmt: skip
-"""The fields of a preset that are message paths."""
+"""The fields of a message type that are message paths."""
 
 
 @dataclass(frozen=True)
-class Preset:
+class MessageType:
     """Message paths of one type: x and y (metres), or latitude and longitude (degrees); a message may lack all others.
 
     covariance       of numbers, row-major, x (east) and y (north) first, m²: 1, 4, 9 or 36 of them, 6 or 21 of an upper
@@ -65,15 +65,15 @@ class Preset:
         return any("[:]" in path for path in (*self.x, *self.latitude))
 
 
-def metric(schema: str, *points: str) -> Preset:
+def metric(schema: str, *points: str) -> MessageType:
     """Positions in metres at alternative paths of something with x, y and z ("" for the message itself)."""
     x, y, z = (tuple(f"{point}.{axis}".lstrip(".") for point in points) for axis in "xyz")
-    return Preset((schema,), x, y, z)
+    return MessageType((schema,), x, y, z)
 
 
-def geodetic(schema: str, point: str = "") -> Preset:
+def geodetic(schema: str, point: str = "") -> MessageType:
     """Positions in degrees with the fields of a fix, in the field `point` of a message ("position.")."""
-    return Preset(
+    return MessageType(
         (schema,),
         latitude=(f"{point}latitude",),
         longitude=(f"{point}longitude",),
@@ -83,10 +83,10 @@ def geodetic(schema: str, point: str = "") -> Preset:
     )
 
 
-def stamped_items(preset: Preset, item: str) -> Preset:
-    """The preset where a message without a stamp or a frame of its own has them in its items ("detections[:].")."""
+def stamped_items(known: MessageType, item: str) -> MessageType:
+    """The type where a message without a stamp or a frame of its own has them in its items ("detections[:].")."""
     return replace(
-        preset,
+        known,
         time=(*TIME_PATHS, *(f"{item}{path}" for path in TIME_PATHS)),
         frame_id=(*FRAME_PATHS, *(f"{item}{path}" for path in FRAME_PATHS)),
     )
