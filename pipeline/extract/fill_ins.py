@@ -8,9 +8,7 @@ from pipeline.arrays import Bools
 from pipeline.extract.plausibility import Suspicions
 from pipeline.extract.positions import Positions, numbered
 
-_FILL_INS: Final = np.array(
-    [(0, 0), (-1, -1), (90, 180), (-90, -180), (180, 180), (999, 999), (9999, 9999), (99999, 99999)], float
-)
+_FILL_INS: Final = ((0, 0), (-1, -1), (90, 180), (-90, -180), (180, 180), (999, 999), (9999, 9999), (99999, 99999))
 _DEGREE_M: Final = 111_000.0
 _MIN_APART_M: Final = 10.0
 _MIN_JUMP_MPS: Final = 10.0
@@ -22,17 +20,22 @@ def without_fill_ins(rows: Positions, role: str, suspicions: Suspicions) -> Posi
     """The rows of one reader without those at 0, 0 and the like, which are told as a suspicion."""
     if len(rows) == 0 or not suspicions.looks_for("place"):
         return rows
-    is_fill_in, agent = np.zeros(len(rows), np.bool_), numbered(rows.agent)
-    places = np.column_stack([rows.first, rows.second])
-    for value in _FILL_INS:
-        is_value = (places == value).all(axis=1)
+    is_fill_in = np.zeros(len(rows), np.bool_)
+    for first, second in _FILL_INS:
+        is_value = (rows.first == first) & (rows.second == second)
+        if not is_value.any():
+            continue
+        agent = numbered(rows.agent)
         for number in np.unique(agent[is_value]):
             of_agent = agent == number
             if _jumps(rows[of_agent], is_value[of_agent]):
                 is_fill_in |= is_value & of_agent
     if not is_fill_in.any():
         return rows
-    at = " and ".join(f"{first:g}, {second:g}" for first, second in np.unique(places[is_fill_in], axis=0))
+    at = " and ".join(
+        f"{first:g}, {second:g}"
+        for first, second in sorted(set(zip(rows.first[is_fill_in], rows.second[is_fill_in], strict=True)))
+    )
     suspicions.add(
         "place", str(rows.topic[0]),
         seen=f"{int(is_fill_in.sum())} of {len(rows)} positions are at {at}, where none of the others could come from or go to",

@@ -20,7 +20,8 @@ _MAX_GAPS: Final = 3.0
 """Rows whose neighbours are further apart than so many median gaps say nothing."""
 _MIN_RESIDUALS: Final = 20
 _MIN_UNNAMED: Final = 40
-_MAX_ROWS: Final = 20_000
+_MAX_ROWS: Final = 4096
+"""More rows of a track would not tell more."""
 _WHITE: Final = (0.7, 1.3)
 """Residuals of twice the stride, in those of the stride: 1 for white noise, 1.4 for a random walk, more for manoeuvres."""
 _MIN_MPS2: Final = 2.0
@@ -57,9 +58,11 @@ def with_scatter(
     """
     found: dict[str, float] = {}
     covariance = rows.covariance_m2.copy()
-    for topic in (str(topic) for topic in dict.fromkeys(rows.topic) if topic not in told_topics):
-        of_topic = rows.topic == topic
-        scatter = _of_topic(rows[of_topic])
+    topics, agents = numbered(rows.topic), numbered(rows.agent)
+    for number in range(int(topics.max(initial=-1)) + 1):
+        of_topic = topics == number
+        topic = str(rows.topic[of_topic.argmax()])
+        scatter = None if topic in told_topics else _of_topic(rows, agents, np.flatnonzero(of_topic))
         if scatter is None:
             continue
         is_stated = of_topic & ~np.isnan(covariance[:, 0])
@@ -85,17 +88,17 @@ def _is_contradicted(topic: str, covariance_m2: Float64s, scatter: Scatter, susp
     return is_vague or is_sure
 
 
-def _of_topic(rows: Positions) -> Scatter | None:
-    """The scatter of the detections of a topic: the median of its agents'; None where they tell of none."""
-    agent = numbered(rows.agent)
+def _of_topic(rows: Positions, agents: Int64s, of_topic: Int64s) -> Scatter | None:
+    """The scatter of the detections `of_topic`: the median of its agents'; None where they tell of none."""
+    order = of_topic[np.argsort(agents[of_topic], kind="stable")]
     found = []
-    for number in np.unique(agent):
-        track = rows[agent == number]
-        is_named = number >= 0
-        if is_named or len(np.unique(track.message)) == len(track):
-            order = np.argsort(track.time_ns, kind="stable")
-            time_s = (track.time_ns[order] - track.time_ns.min()) * 1e-9
-            scatter = scatter_of(time_s, np.column_stack([track.first, track.second])[order], is_named)
+    for track in np.split(order, np.flatnonzero(np.diff(agents[order])) + 1):
+        is_named = bool(agents[track[0]] >= 0)
+        track = track[:_MAX_ROWS]
+        if is_named or len(np.unique(rows.message[track])) == len(track):
+            track = track[np.argsort(rows.time_ns[track], kind="stable")]
+            time_s = (rows.time_ns[track] - rows.time_ns[track[0]]) * 1e-9
+            scatter = scatter_of(time_s, np.column_stack([rows.first[track], rows.second[track]]), is_named)
             found += [] if scatter is None else [scatter]
     return _median(found)
 
@@ -115,7 +118,7 @@ def scatter_of(time_s: Float64s, position_m: Float64s, is_one: bool) -> Scatter 
     `is_one`: the rows are known to be one target's.
     """
     is_new = np.diff(time_s, prepend=-np.inf) > 0
-    time_s, position_m = time_s[is_new][:_MAX_ROWS], position_m[is_new][:_MAX_ROWS]
+    time_s, position_m = time_s[is_new], position_m[is_new]
     if len(time_s) < (_MIN_RESIDUALS if is_one else _MIN_UNNAMED) + 8:
         return None
     near, far = (_residuals(time_s, position_m, stride) for stride in (1, 2))

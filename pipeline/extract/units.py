@@ -30,13 +30,15 @@ _UTM_EASTING_M: Final = (1e5, 9e5)
 _MAX_HEIGHT_M: Final = 2e4
 _MAX_RADIAN_SPEED_MPS: Final = 260.0
 """What would be faster in radians is no vehicle in radians, but a slower one in degrees."""
-_MAX_DEGREE_SPEED_MPS: Final = 2e4
-"""Nothing on a map is faster than an orbit: a walk of 1 m/s in fields of degrees would make 111 km/s."""
+_MAX_DEGREE_SPEED_MPS: Final = 3e3
+"""No aircraft is faster; a walk of 1 m/s in fields of degrees would make 111 km/s."""
 _NULL_ISLAND_DEG: Final = 0.1
 """Simulators without a place are at 0, 0."""
 _MIN_SCALED: Final = 1e5
 _MOST: Final = 0.9
 _MIN_ROWS: Final = 10
+_MAX_ROWS: Final = 4096
+"""More rows of a source would not tell more."""
 _SMOOTH: Final = 0.1
 """Rows without a name are one target's where the median step is a smaller share of their extent than this."""
 _MAX_WAY_M: Final = 0.5
@@ -73,7 +75,8 @@ def in_true_units(source: SourceConfig, role: str, rows: Positions, suspicions: 
     rows = _named_centre(rows)
     if not suspicions.looks_for("place"):
         return rows
-    found = _of_degrees(rows) if is_geodetic else _of_metres(rows)
+    some = rows[:: 1 + len(rows) // _MAX_ROWS]
+    found = _of_degrees(some) if is_geodetic else _of_metres(some)
     if found is None:
         return rows
     setting = f"{found.setting} in its [[extract.{role}]]"
@@ -184,7 +187,7 @@ def _named_centre(rows: Positions) -> Positions:
 
 def _is_named_centre(rows: Positions) -> Bools:
     named = [name for name in set(rows.frame_id) if str(name).rpartition("/")[2].lower() in EARTH_CENTRED]
-    return np.isin(rows.frame_id.astype(np.str_), named)
+    return np.isin(rows.frame_id.astype(np.str_), named) if named else np.zeros(len(rows), np.bool_)
 
 
 def _from_centre(rows: Positions, is_centred: Bools) -> Positions:
