@@ -185,11 +185,12 @@ def _directories(groups: Sequence[tuple[str, ...]], out: str) -> list[str]:
     Others: among the missions given, or one that was run into that directory earlier and whose log still exists, or a file
     that lies beside mission directories. The mission whose results are there already keeps the plain name.
     """
-    names = [mission_name([_place(part) for part in group]) for group in groups]
+    places = [[_place(part) for part in group] for group in groups]
+    names = [mission_name(group) for group in places]
     counts = Counter(names)
     found = []
-    for name, group in zip(names, groups, strict=True):
-        plain, place = f"{out.rstrip('/') or '/'}/{name}", _place(group[0])
+    for name, (place, *_) in zip(names, places, strict=True):
+        plain = f"{out.rstrip('/') or '/'}/{name}"
         holder = None if is_url(out) else _ingested_log(Path(plain))
         is_shared = counts[name] > 1 or (holder is not None and holder.exists())
         is_shared |= name in _TAKEN_NAMES

@@ -29,15 +29,14 @@ def group_parts(paths: Sequence[Path]) -> list[tuple[Path, ...]]:
     beside them names together belong together; every other path is a mission of its own. Repetitions are left out.
     """
     given = [part for path in paths for part in recorded_parts(path) or (path,)]
+    places: dict[Path, Path] = {}
+    for path in given:
+        places.setdefault(path.resolve(), path)
     numbers = functools.cache(_numbers)
     groups: dict[Path, dict[Path, int]] = {}
-    seen: set[Path] = set()
-    for path in given:
-        if path.resolve() in seen:
-            continue
-        seen.add(path.resolve())
+    for place, path in places.items():
         number = numbers(path.parent).get(path.name)
-        groups.setdefault((path if number is None else path.parent).resolve(), {})[path] = number or 0
+        groups.setdefault(place if number is None else path.parent.resolve(), {})[path] = number or 0
     return [tuple(sorted(group, key=group.__getitem__)) for group in groups.values()]
 
 

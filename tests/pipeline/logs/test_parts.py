@@ -1,6 +1,7 @@
 import pytest
 
-from pipeline.logs.parts import group_parts, missing_parts, mission_name, recorded_parts
+from pipeline.logs import parts
+from pipeline.logs.parts import group_parts, missing_parts, mission_name, named_parts, recorded_parts
 
 METADATA = """rosbag2_bagfile_information:
   version: 5
@@ -90,3 +91,14 @@ def test_a_name_that_cannot_be_appended_to_is_cut_and_stays_its_own(tmp_path):
     umlauts = mission_name([tmp_path / f"{'ü' * 115}.mcap"])
     assert umlauts.startswith("ü" * 100 + "-") and len(umlauts) == 109
     assert len(mission_name([tmp_path / f"n{'ü' * 115}.mcap"]).encode()) <= 209  # the cut is between letters
+
+
+def test_metadata_is_read_once_for_all_parts(bag, monkeypatch):
+    names = [f"bag_{i}.mcap" for i in range(300)]
+    folder = bag("bag", names, names)
+    opened = []
+    text = (folder / "metadata.yaml").read_text()
+    monkeypatch.setattr(parts, "named_parts", lambda found: opened.append(found) or named_parts(found))
+    assert len(group_parts([folder / name for name in names])[0]) == 300
+    assert opened == [text]
+    assert missing_parts([folder / name for name in names]) == () and opened == [text] * 2
