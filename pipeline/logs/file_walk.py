@@ -1,14 +1,14 @@
 """A walk from record to record over a file that may be damaged."""
 
 import bisect
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from typing import BinaryIO, Final, NamedTuple
 
 from mcap.opcode import Opcode
 
 from pipeline.logs.plan import is_span
 from pipeline.logs.records import CHUNK_HEAD, HEAD, MAGIC, TEXT_MAGIC, DamagedRecord, parse_message_index
-from pipeline.logs.resync import find_recording, find_records
+from pipeline.logs.resync import RecordSearch, find_recording
 from pipeline.logs.rows import Index
 
 MAX_SMALL_BYTES: Final = 2**26
@@ -34,6 +34,7 @@ class FileWalk:
     limit       where the walk ends: behind the data where an index says where that is, else at the end
     places      sorted offsets where records are known to begin; empty where no index tells
     position    of the record at which the walk stands
+    search      for records, where no index tells
     unsure      byte from which on nothing tells that the record before the position was one: it may hide a recording's end
     """
 
@@ -42,6 +43,7 @@ class FileWalk:
         self.is_text = self.read(begin, len(TEXT_MAGIC)) == TEXT_MAGIC
         self.position = begin + len(TEXT_MAGIC if self.is_text else MAGIC)
         self.unsure = self.position
+        self.search = RecordSearch(file, limit)
 
     def read(self, offset: int, length: int) -> bytes:
         """These bytes of the file; `DamagedRecord` where the recording does not have them."""
@@ -96,7 +98,7 @@ class FileWalk:
         start, end, *_ = CHUNK_HEAD.unpack_from(data, HEAD.size)
         return (start, end) if is_span(start, end) else None
 
-    def pass_damage(self, channel_ids: Collection[int]) -> int | None:
+    def pass_damage(self, channel_ids: Collection[int], on_position: Callable[[int], object]) -> int | None:
         """Leave the position for the next place that can be believed: the index tells it, or records are searched for.
 
         Returns where another recording begins in what was passed or in the record before it, if one does: a recording that
@@ -106,7 +108,7 @@ class FileWalk:
         if following < len(self.places):
             place = self.places[following]
         else:
-            place = find_records(self.file, self.position + 1, self.limit, channel_ids)
+            place = self.search.find(self.position + 1, channel_ids, on_position)
         other = find_recording(self.file, self.unsure, place)
         self.go(place, is_sure=True)
         return other

@@ -6,6 +6,7 @@ from collections.abc import Callable, Collection, Mapping
 from functools import partial
 from typing import BinaryIO, Final
 
+import numpy as np
 from mcap.opcode import Opcode
 
 from pipeline.logs.records import (
@@ -24,9 +25,9 @@ from pipeline.logs.records import (
 from pipeline.logs.summary import SUMMARY_OPCODES, parse_summary_record
 
 _WINDOW_BYTES: Final = 2**20
-_MAX_SEARCH_BYTES: Final = 2**28
 _BELIEVED: Final = 3  # points that make a place believable, see `_points`
-_CANDIDATE: Final = re.compile(rb"[\x01-\x0f](?=[\x00-\xff]{5}\x00{3})")  # an opcode and a length below 2**40
+_MAX_PARSED_BYTES: Final = 2**25
+_CHECK_BYTES: Final = 2**8  # what a look at one place costs, in bytes that are parsed
 _BEGINNING: Final = re.compile(re.escape(MAGIC) + rb"\x01[\x00-\xff]{2}\x00{6}")  # magic and the head of a small header
 _BEGINNING_BYTES: Final = len(MAGIC) + HEAD.size
 _MAX_HEADER_BYTES: Final = 2**16
@@ -36,19 +37,99 @@ _PARSERS: Final[Mapping[int, Callable[[bytes], object]]] = {
     Opcode.METADATA: parse_metadata,
     **{opcode: partial(parse_summary_record, opcode) for opcode in SUMMARY_OPCODES},
 }
+_LEAST: Final = np.full(256, 2**62)
+"""The least length of a record by its opcode; more than any file has for what is not looked for."""
+for _opcode, _length in (
+    (Opcode.MESSAGE, MESSAGE_HEAD.size), (Opcode.CHUNK, CHUNK_HEAD.size + 8), (Opcode.MESSAGE_INDEX, 6), (Opcode.DATA_END, 4),
+    (Opcode.CHANNEL, 16), (Opcode.SCHEMA, 14), (Opcode.METADATA, 8), (Opcode.STATISTICS, 46), (Opcode.CHUNK_INDEX, 64),
+    (Opcode.ATTACHMENT_INDEX, 48), (Opcode.METADATA_INDEX, 20), (Opcode.SUMMARY_OFFSET, 17), (Opcode.FOOTER, 20),
+):  # fmt: skip
+    _LEAST[_opcode] = _length
 
 
-def find_records(file: BinaryIO, begin: int, limit: int, channel_ids: Collection[int]) -> int:
-    """The first place from `begin` on where plausible records follow each other; `limit` where there is none."""
-    for window in range(begin, min(limit, begin + _MAX_SEARCH_BYTES), _WINDOW_BYTES):
-        file.seek(window)
-        data = file.read(_WINDOW_BYTES + HEAD.size - 1)
-        for match in _CANDIDATE.finditer(data):
-            _, length = HEAD.unpack_from(data, match.start())
-            offset = window + match.start()
-            if offset + HEAD.size + length <= limit and _is_believable(file, offset, limit, channel_ids):
-                return offset
-    return limit
+class RecordSearch:
+    """Looks for records in one recording, `limit` its end, where nothing tells where they begin.
+
+    All of the searches together parse a limited number of bytes: files can be made of nothing but beginnings of records.
+
+    is_given_up  whether a search has ended because of that
+    """
+
+    def __init__(self, file: BinaryIO, limit: int) -> None:
+        self.file, self.limit = file, limit
+        self.is_given_up = False
+        self._budget = _MAX_PARSED_BYTES
+
+    def find(self, begin: int, channel_ids: Collection[int], on_position: Callable[[int], object]) -> int:
+        """The first place from `begin` on where plausible records follow each other; the limit where there is none."""
+        for window in range(begin, self.limit, _WINDOW_BYTES):
+            on_position(window)
+            self.file.seek(window)
+            data = self.file.read(min(2 * _WINDOW_BYTES, self.limit - window))
+            for offset in _candidates(data, self.limit - window):
+                if offset >= _WINDOW_BYTES:
+                    break
+                if self._is_believable(window + offset, channel_ids):
+                    return window + offset
+                if self._budget < 0:
+                    self.is_given_up = True
+                    return self.limit
+        return self.limit
+
+    def _is_believable(self, offset: int, channel_ids: Collection[int]) -> bool:
+        """Whether plausible records follow each other from `offset` on, enough of them or up to the end."""
+        points = 0
+        while points < _BELIEVED and offset < self.limit:
+            self._budget -= _CHECK_BYTES
+            self.file.seek(offset)
+            head = self.file.read(HEAD.size)
+            if len(head) < HEAD.size:
+                return False
+            opcode, length = HEAD.unpack(head)
+            found = self._points(opcode, length, channel_ids) if offset + HEAD.size + length <= self.limit else 0
+            if found == 0:
+                return False
+            if opcode == Opcode.DATA_END:
+                return points > 0
+            points += found
+            offset += HEAD.size + length
+        return True
+
+    def _points(self, opcode: int, length: int, channel_ids: Collection[int]) -> int:
+        """How much the record whose body begins here speaks for itself: 2 where lengths inside agree with the outer one."""
+        if opcode == Opcode.MESSAGE and length >= MESSAGE_HEAD.size:
+            return int(struct.unpack("<H", self.file.read(2))[0] in channel_ids)
+        if opcode == Opcode.CHUNK and length > CHUNK_HEAD.size:
+            return 2 * int(is_chunk_head(self.file.read(CHUNK_HEAD_BYTES), length))
+        if opcode == Opcode.MESSAGE_INDEX and length >= 6:
+            return 2 * (struct.unpack("<xxI", self.file.read(6))[0] == length - 6 and (length - 6) % 16 == 0)
+        if opcode in _PARSERS and length <= _WINDOW_BYTES:
+            self._budget -= length
+            try:
+                _PARSERS[opcode](self.file.read(length))
+            except DamagedRecord:
+                return 0
+            return 2
+        return int(opcode == Opcode.DATA_END and length == 4)
+
+
+def _candidates(data: bytes, size: int) -> list[int]:
+    """Where in `data` the head of a record may stand that another may follow, or the end of the `size` bytes there are."""
+    heads = np.frombuffer(data, np.uint8)
+    num_places = max(0, len(heads) - HEAD.size + 1)
+    places = np.flatnonzero(_LEAST[heads[:num_places]] < size)
+    places = places[(heads[places + 6] | heads[places + 7] | heads[places + 8]) == 0]  # lengths are below 2**40
+    lengths = np.zeros(len(places), np.int64)
+    for byte in range(5):
+        lengths |= heads[places + 1 + byte].astype(np.int64) << 8 * byte
+    is_long_enough = lengths >= _LEAST[heads[places]]
+    places, ends = places[is_long_enough], (places + HEAD.size + lengths)[is_long_enough]
+    is_place = np.zeros(num_places + 1, np.bool_)
+    is_place[places] = True
+    # The end mark is followed by anything; what ends outside is looked at by itself.
+    is_followed = (ends == size) | is_place[np.minimum(ends, num_places)] | (heads[places] == Opcode.DATA_END)
+    found: list[int] = places[is_followed | ((ends >= num_places) & (ends < size))].tolist()
+    return found
 
 
 def begins_recording(file: BinaryIO, offset: int, limit: int) -> bool:
@@ -75,39 +156,3 @@ def find_recording(file: BinaryIO, begin: int, end: int) -> int | None:
             if begins_recording(file, window + match.start(), end):
                 return window + match.start()
     return None
-
-
-def _is_believable(file: BinaryIO, offset: int, limit: int, channel_ids: Collection[int]) -> bool:
-    """Whether plausible records follow each other from `offset` on, enough of them or up to the end."""
-    points = 0
-    while points < _BELIEVED and offset < limit:
-        file.seek(offset)
-        head = file.read(HEAD.size)
-        if len(head) < HEAD.size:
-            return False
-        opcode, length = HEAD.unpack(head)
-        found = _points(file, opcode, length, channel_ids) if offset + HEAD.size + length <= limit else 0
-        if found == 0:
-            return False
-        if opcode == Opcode.DATA_END:
-            return points > 0
-        points += found
-        offset += HEAD.size + length
-    return True
-
-
-def _points(file: BinaryIO, opcode: int, length: int, channel_ids: Collection[int]) -> int:
-    """How much the record whose body begins here speaks for itself: 2 where lengths inside agree with the outer one."""
-    if opcode == Opcode.MESSAGE and length >= MESSAGE_HEAD.size:
-        return int(struct.unpack("<H", file.read(2))[0] in channel_ids)
-    if opcode == Opcode.CHUNK and length > CHUNK_HEAD.size:
-        return 2 * is_chunk_head(file.read(CHUNK_HEAD_BYTES), length)
-    if opcode == Opcode.MESSAGE_INDEX and length >= 6:
-        return 2 * (struct.unpack("<xxI", file.read(6))[0] == length - 6 and (length - 6) % 16 == 0)
-    if opcode in _PARSERS and length <= _WINDOW_BYTES:
-        try:
-            _PARSERS[opcode](file.read(length))
-        except DamagedRecord:
-            return 0
-        return 2
-    return int(opcode == Opcode.DATA_END and length == 4)

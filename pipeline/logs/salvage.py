@@ -72,7 +72,7 @@ class Scan:
             try:
                 self._step()
             except DamagedRecord as error:
-                self._pass_damage(str(error))
+                self._pass_damage(str(error), on_position)
             on_position(walk.position)
         if self.following == walk.end:
             self._look_back()
@@ -260,15 +260,16 @@ class Scan:
         elif self.tail.closing >= 0:
             self.end = self.tail.closing
 
-    def _pass_damage(self, reason: str) -> None:
+    def _pass_damage(self, reason: str, on_position: Callable[[int], object]) -> None:
         """After damage at the position: note the loss, go on at the next place that can be believed."""
         walk, offset = self.walk, self.walk.position
         self.builder.flush()
         span = walk.span_at(offset)
-        other = walk.pass_damage(self.plan.channels)
+        other = walk.pass_damage(self.plan.channels, on_position)
         if other is not None:
             self._stop(other)
             return
         where = f"bytes {offset} to {walk.position}" if not walk.is_over() else f"everything from byte {offset} on"
+        where += " (too much of it looks like records)" if walk.search.is_given_up else ""
         self.builder.add_loss(offset, f"{reason}; {where} skipped", span)
         self.previous = Opcode.CHUNK  # whatever lay there may have been a chunk with its indexes
