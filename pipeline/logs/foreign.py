@@ -3,8 +3,6 @@
 import re
 from pathlib import Path
 
-from pipeline.logs.records import MAGIC
-
 HEAD_BYTES = 512
 
 CONVERT = "`rosbags-convert --src {source} --dst {stem}_mcap --dst-storage mcap`, and give the folder {stem}_mcap"
@@ -17,7 +15,7 @@ _KINDS = {
     b"\x1f\x8b": "compressed with gzip; unpack it first",
     b"\x28\xb5\x2f\xfd": "compressed with zstd; unpack it first",
     b"PK\x03\x04": "a ZIP archive; unpack it first",
-    MAGIC[:5]: "an MCAP of another version, or one whose line ends a copy has changed; copy it in binary mode",
+    b"\x89MCAP": "an MCAP of another version, or one whose line ends a copy has changed; copy it in binary mode",
 }
 _TABLE = re.compile(rb"[\x20-\x7e\x80-\xff]*[,;\t][\x20-\x7e\x80-\xff,;\t]*\r?\n")
 
