@@ -144,6 +144,12 @@ def test_foreseen_failure_is_one_line_with_its_code(fake_infer, capsys):
     assert capsys.readouterr() == ("", "cadence: error: m: nothing here; look elsewhere\n")
 
 
+def test_training_on_a_folder_that_is_not_there(tmp_path, capsys):
+    code = cli.main(["train", "--out", str(tmp_path / "run"), "--set", f"train.data={tmp_path / 'absent'}"])
+    said = capsys.readouterr()
+    assert (code, said.out) == (InputError.exit_code, "") and said.err.count("\n") == 1 and "absent" in said.err
+
+
 def test_interruption_says_that_finished_stages_are_kept(fake_infer, capsys):
     fake_infer(raiser(KeyboardInterrupt()))
     assert cli.main(["infer", "m"]) == 130

@@ -134,7 +134,7 @@ def _start_once(context: ForkServerContext, run: RunTask, task: LogTask) -> _Wor
 
 @contextlib.contextmanager
 def _interrupts_held() -> Iterator[None]:
-    """What is started meanwhile never hears Ctrl-C, which reaches every process of a terminal; ours is heard afterwards."""
+    """What is started meanwhile never hears Ctrl-C, which reaches every process of a terminal; we hear it all the same."""
     resource_tracker.ensure_running()  # where it starts, it lets interrupts through again
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:

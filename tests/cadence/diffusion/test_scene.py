@@ -1,6 +1,7 @@
 """The scene model: how tracks are stated, what the network is told, sampling, and its two losses."""
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 import pytest
@@ -297,3 +298,31 @@ def test_contexts_are_checked() -> None:
     with pytest.raises(ValueError, match="tracker_m"):
         Context(torch.zeros(2, 2), tracker_m=torch.zeros(2, 3, 2))
     assert Context(torch.zeros(4, 2), elapsed_s=torch.arange(4.0))[torch.tensor([2])].elapsed_s == torch.tensor([2.0])
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"num_future": 29}, "120 steps"),
+        ({"num_gap": 0}, "num_gap be at least 1"),
+        ({"max_step_m": 0.0}, "must be positive"),
+        ({"few_steps": -1}, "must not be negative"),
+        ({"num_gap": 7}, "multiple of 2"),
+    ],
+)
+def test_settings_of_the_scene_that_cannot_be(changes: dict[str, float], says: str) -> None:
+    with pytest.raises(ValueError, match=says):
+        dataclasses.replace(CONFIG, **changes)
+
+
+@pytest.mark.parametrize(
+    ("settings", "says"),
+    [
+        ({"guidance": "paper", "sampler": "dpmpp"}, "ddpm"),
+        ({"num_steps": 0}, "at least 1"),
+        ({"margin_m": -1.0}, "not negative"),
+    ],
+)
+def test_settings_of_the_sampling_that_cannot_be(settings: dict[str, Any], says: str) -> None:
+    with pytest.raises(ValueError, match=says):
+        SceneSampling(**settings)
