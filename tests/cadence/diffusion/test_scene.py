@@ -181,7 +181,7 @@ def test_guidance_and_repair_keep_out_of_obstacles(guidance: str) -> None:
     unguided = float(states_in_collision(free, walls, offset_m=cut.context.datum_m[:, None, None, None]).double().mean())
     assert unguided > 0.01
     if guidance in ("final", "clean"):
-        assert shares[False][0] < 0.3 * unguided
+        assert shares[False][0] < 0.4 * unguided
     assert shares[True][0] < 0.02 * unguided and shares[True][1] < 0.02
 
 
