@@ -18,6 +18,10 @@ from pipeline.suggestions import did_you_mean
 
 T = TypeVar("T")
 
+_SMALLEST, _LARGEST = 1e-9, 1e9
+"""A nanosecond to 30 years, an atom to beyond the moon: other numbers are typing errors, and overflow further on."""
+_LARGEST_SEED = 2**63 - 1
+
 TABLES = ("ingest", "extract", "infer", "export", "report", "evaluate", "simulate", "train")
 """The tables of a configuration file, one a stage. One file may hold all of them; each command reads its own."""
 
@@ -57,9 +61,9 @@ def stage_config(
     tables = load_tables(path, overrides)
     names = {field.name for field in dataclasses.fields(cls)}  # type: ignore[arg-type]
     config = (
-        read_config(cls, {name: value for name, value in tables.items() if name in names}, "")
+        read_settings(cls, {name: value for name, value in tables.items() if name in names}, "")
         if table is None
-        else read_config(cls, tables.get(table, {}), table)
+        else read_settings(cls, tables.get(table, {}), table)
     )
     return config if seed is None else with_seed(config, seed)
 
@@ -104,6 +108,22 @@ def merge_overrides(tables: Mapping[str, Any], overrides: Sequence[str]) -> dict
             node = child
         node[path[-1]] = value
     return merged
+
+
+def read_settings(cls: type[T], tables: Mapping[str, Any], where: str) -> T:
+    """What a person states, as `read_config` reads it; numbers that no setting can mean are refused."""
+    _check_numbers(tables, where)
+    return read_config(cls, tables, where)
+
+
+def _check_numbers(value: Any, where: str) -> None:
+    if isinstance(value, Mapping | list | tuple):
+        for key, item in value.items() if isinstance(value, Mapping) else enumerate(value):
+            _check_numbers(item, f"{where}[{key}]" if isinstance(key, int) else f"{where}.{key}".lstrip("."))
+    elif isinstance(value, int | float) and math.isfinite(value) and value:
+        largest = _LARGEST_SEED if where.rpartition(".")[2] == "seed" else _LARGEST
+        if not _SMALLEST <= abs(value) <= largest:
+            raise ConfigError(f"{where}: {value:g} is beyond what it can mean, {_SMALLEST:g} to {largest:g}; correct it")
 
 
 def read_config(cls: type[T], tables: Mapping[str, Any], where: str = "config") -> T:

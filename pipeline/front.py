@@ -13,7 +13,7 @@ from cadence.errors import InputError
 from pipeline.batch.config import RunConfig
 from pipeline.batch.outcome import LogOutcome
 from pipeline.batch.run import run
-from pipeline.config import read_config
+from pipeline.config import read_settings
 from pipeline.evaluate.stage import EvaluateConfig, evaluate
 from pipeline.missions import is_mission_directory
 from pipeline.obstacle_file import OBSTACLES_NAME, read_obstacles
@@ -69,7 +69,7 @@ def run_logs(
         What became of each mission. Failures are in the outcomes (`status`, `message`), not raised.
     """
     several = [logs] if isinstance(logs, str | Path) else logs
-    config = read_config(RunConfig, settings or {}, "")
+    config = read_settings(RunConfig, settings or {}, "")
     return run([str(log) for log in several], str(out), config, Progress(quiet=True), num_workers=num_workers)
 
 
@@ -91,6 +91,6 @@ def evaluate_mission(directory: str | Path, settings: Settings | None = None) ->
     Returns:
         The headline: rows with estimator, part, metric and value; scores.csv holds all, with intervals.
     """
-    config = read_config(EvaluateConfig, settings or {}, "evaluate")
+    config = read_settings(EvaluateConfig, settings or {}, "evaluate")
     found: list[dict[str, Any]] = list(evaluate(Path(directory), config, Progress(quiet=True)).summary["scores"])
     return found

@@ -7,7 +7,15 @@ from typing import Literal
 import pytest
 
 from cadence.errors import ConfigError
-from pipeline.config import config_as_dict, load_tables, load_toml, merge_overrides, parse_override, read_config
+from pipeline.config import (
+    config_as_dict,
+    load_tables,
+    load_toml,
+    merge_overrides,
+    parse_override,
+    read_config,
+    read_settings,
+)
 
 
 @dataclass(frozen=True)
@@ -152,3 +160,18 @@ def test_what_was_meant_is_said_also_where_it_stands_in_a_table_inside():
         read_config(Outer, {"name": "n", "ratio": 1})
     with pytest.raises(ConfigError, match=r"unknown key 'zzz'; known keys: name"):
         read_config(Outer, {"name": "n", "zzz": 1})
+
+
+@pytest.mark.parametrize("number", ["1e300", "-1e10", "1e-300", str(10**30), str(2**63 - 1)])
+def test_numbers_that_no_setting_can_mean_are_refused(number):
+    with pytest.raises(ConfigError, match=r"infer\.grid\.step_s: \S+ is beyond what it can mean, 1e-09 to 1e\+09; correct it"):
+        read_settings(Outer, {"rows": [{"ratio": 1.0}], "grid": {"step_s": parse_override(f"a={number}")[1]}}, "infer")
+    with pytest.raises(ConfigError, match=r"rows\[1\]\.ratio"):
+        read_settings(Outer, {"rows": [{"ratio": 1.0}, {"ratio": parse_override(f"a={number}")[1]}]}, "")
+
+
+def test_numbers_at_the_limits_seeds_and_no_limit_at_all_are_settings():
+    config = read_settings(Outer, {"name": "n", "count": 10**9, "inner": {"ratio": float("inf")}, "sizes_m": [1e-9, 0]}, "")
+    assert config.count == 10**9 and config.inner.ratio == float("inf") and config.sizes_m == (1e-9, 0.0)
+    with pytest.raises(ConfigError, match="unknown key 'seed'"):  # its size was no reason to refuse it
+        read_settings(Outer, {"seed": 2**63 - 1}, "")
