@@ -201,7 +201,7 @@ def extract(
       cadence extract results/flight
       cadence extract results/flight --config mapping.toml --force
     """
-    from pipeline.extract.stage import ExtractConfig
+    from pipeline.extract.config import ExtractConfig
     from pipeline.extract.stage import extract as stage
 
     resolved = stage_config(ExtractConfig, "extract", config, [*(settings or ()), *_STRICT * strict], seed)

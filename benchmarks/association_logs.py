@@ -74,7 +74,8 @@ def rendezvous_logs(seed: int, number: int) -> list[Log]:
 
 def ship_log() -> Log:
     """The real log, read by the pipeline; truth between reports at most two minutes apart; the first quarter is for tuning."""
-    from pipeline.extract.stage import ExtractConfig, extract
+    from pipeline.extract.config import ExtractConfig
+    from pipeline.extract.stage import extract
     from pipeline.ingest.stage import IngestConfig, ingest
     from pipeline.progress import Progress
     from pipeline.tables import read_table

@@ -30,7 +30,8 @@ from pipeline.estimators.samplings import GeneralSampling, Samplings
 from pipeline.evaluate.rivals import RIVALS
 from pipeline.evaluate.scores import METRICS, PARTS, Cells, compare, groups_of
 from pipeline.evaluate.stage import default_truth_gap_s
-from pipeline.extract.stage import ExtractConfig, extract
+from pipeline.extract.config import ExtractConfig
+from pipeline.extract.stage import extract
 from pipeline.extract.thinning import ThinningConfig
 from pipeline.files import write_atomic
 from pipeline.ingest.stage import IngestConfig, ingest

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 
 from pipeline.export.stage import ExportConfig
-from pipeline.extract.stage import ExtractConfig
+from pipeline.extract.config import ExtractConfig
 from pipeline.infer.config import InferConfig
 from pipeline.ingest.stage import IngestConfig
 from pipeline.report.stage import ReportConfig

@@ -18,7 +18,7 @@ from cadence.errors import CadenceError, InputError
 from cadence.recordings import Recordings
 from pipeline.config import config_as_dict
 from pipeline.episodes.recorded_logs import Gridding, LogEpisodes, read_log_episodes
-from pipeline.extract.stage import ExtractConfig
+from pipeline.extract.config import ExtractConfig
 from pipeline.files import hash_file, replacing
 from pipeline.obstacle_file import as_obstacles, obstacles_as_json
 from pipeline.progress import Progress

@@ -7,8 +7,9 @@ from pathlib import Path
 from typing import Any, Literal
 
 from cadence.errors import CadenceError, ImplausibleInputError, InputError, PartialInputError, UsageError
+from pipeline.extract.config import ExtractConfig
 from pipeline.extract.plausibility import few, suspicions_in
-from pipeline.extract.stage import ExtractConfig, write_tables
+from pipeline.extract.stage import write_tables
 from pipeline.ingest.stage import survey_channels
 from pipeline.inspect.log_times import time_remarks
 from pipeline.logs.container import container_remarks

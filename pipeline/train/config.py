@@ -18,7 +18,7 @@ from cadence.training.synthetic import SyntheticConfig
 from cadence.worlds.patrol import PatrolConfig
 from pipeline.episodes.pool import EpisodeSource
 from pipeline.episodes.recordings import RecordingsConfig
-from pipeline.extract.stage import ExtractConfig
+from pipeline.extract.config import ExtractConfig
 
 
 def _patrol() -> PatrolConfig:

@@ -8,7 +8,8 @@ import pyarrow as pa
 
 from cadence.errors import CadenceError, InputError
 from cadence.worlds.episode import Episode
-from pipeline.extract.stage import ExtractConfig, extract
+from pipeline.extract.config import ExtractConfig
+from pipeline.extract.stage import extract
 from pipeline.ingest.stage import IngestConfig, ingest
 from pipeline.missions import mission_directories
 from pipeline.progress import Progress

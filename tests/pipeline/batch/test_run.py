@@ -12,7 +12,7 @@ from pipeline.batch.outcome import complaints, exit_code
 from pipeline.batch.run import run, selection_settings
 from pipeline.batch.summaries import batch_summary
 from pipeline.config import stage_config
-from pipeline.extract.stage import ExtractConfig
+from pipeline.extract.config import ExtractConfig
 from pipeline.manifest import StageResult
 from pipeline.missions import mission_directories
 from pipeline.progress import Progress

@@ -13,8 +13,9 @@ from fixtures.small_logs import START_NS, Row, detection, fix, pose, write_log
 
 from cadence.errors import CadenceError, ConfigError, InputError, NothingDetectedError
 from pipeline.config import read_config
+from pipeline.extract.config import ExtractConfig
 from pipeline.extract.selection import ROLES, _no_detections, select_readers
-from pipeline.extract.stage import ExtractConfig, extract, write_tables
+from pipeline.extract.stage import extract, write_tables
 from pipeline.extract.thinning import ThinningConfig
 from pipeline.ingest.stage import IngestConfig, ingest
 from pipeline.logs.reader import Channel, open_log

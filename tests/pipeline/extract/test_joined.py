@@ -9,7 +9,8 @@ from fixtures.small_logs import Row, detection, time_ns, write_log
 from test_extract import QUIET, fails, mk, run
 
 from cadence.errors import InputError
-from pipeline.extract.stage import ExtractConfig, write_tables
+from pipeline.extract.config import ExtractConfig
+from pipeline.extract.stage import write_tables
 from pipeline.logs.reader import open_log
 
 ROS = Builder(store_with())

@@ -8,7 +8,8 @@ from mcap.writer import Writer
 
 from cadence.errors import InputError
 from pipeline.catalogue import open_catalogued_log, read_catalogue
-from pipeline.extract.stage import ExtractConfig, extract
+from pipeline.extract.config import ExtractConfig
+from pipeline.extract.stage import extract
 from pipeline.files import hash_file
 from pipeline.ingest.stage import IngestConfig, ingest
 from pipeline.logs.reader import open_log

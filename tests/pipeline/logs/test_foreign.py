@@ -15,7 +15,8 @@ from rosbags.typesys import Stores, get_typestore
 import cli
 from cadence.errors import InputError
 from pipeline.config import read_config
-from pipeline.extract.stage import ExtractConfig, write_tables
+from pipeline.extract.config import ExtractConfig
+from pipeline.extract.stage import write_tables
 from pipeline.logs.reader import open_log
 from pipeline.missions import find_missions
 from pipeline.progress import Progress

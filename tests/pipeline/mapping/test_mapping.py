@@ -7,7 +7,7 @@ import pytest
 
 from cadence.errors import ConfigError
 from pipeline.config import read_config
-from pipeline.extract.stage import ExtractConfig
+from pipeline.extract.config import ExtractConfig
 from pipeline.mapping.guess import SuggestedMapping, dense_sources, suggest_mapping
 from pipeline.mapping.sources import SourceConfig, resolve_paths
 

@@ -10,7 +10,8 @@ import pytest
 
 from cadence.worlds.rendezvous import RendezvousConfig, simulate_rendezvous
 from cadence.worlds.rendezvous_map import GOALS_M, SITES_M
-from pipeline.extract.stage import ExtractConfig, extract
+from pipeline.extract.config import ExtractConfig
+from pipeline.extract.stage import extract
 from pipeline.ingest.stage import IngestConfig, ingest
 from pipeline.logs.reader import open_log
 from pipeline.mapping.guess import suggest_mapping

@@ -22,7 +22,7 @@ from pipeline.episodes.pool import EpisodeSource
 from pipeline.episodes.recordings import RecordingsConfig, save_recordings
 from pipeline.estimators.paper import absolute_grid, load_absolute
 from pipeline.estimators.presets import load_forecaster
-from pipeline.extract.stage import ExtractConfig
+from pipeline.extract.config import ExtractConfig
 from pipeline.progress import Progress
 from pipeline.simulate.stage import SimulateConfig, simulate
 from pipeline.train.config import AbsoluteTraining, TrainConfig

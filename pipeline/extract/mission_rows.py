@@ -1,0 +1,176 @@
+"""Positions as read → the rows of every role, in the mission frame, as far as they can be meant."""
+
+import itertools
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+
+from cadence.errors import InputError, NothingDetectedError
+from pipeline.extract.config import ExtractConfig
+from pipeline.extract.fill_ins import without_fill_ins
+from pipeline.extract.joined import check_joined
+from pipeline.extract.mission_clock import on_one_clock
+from pipeline.extract.names import Naming, without_false_names
+from pipeline.extract.placement import Placing, bring_together, in_enu, mission_frame, place
+from pipeline.extract.plausibility import Suspicions, few
+from pipeline.extract.positions import ChannelReader, Positions, Rows
+from pipeline.extract.reuse import without_reused_names
+from pipeline.extract.selection import ROLES
+from pipeline.extract.spikes import is_spike
+from pipeline.extract.stages import without_other_stages
+from pipeline.extract.stretches import without_set_back, without_unjoined
+from pipeline.extract.thinning import ThinningConfig, is_seen, noise
+from pipeline.extract.transform_messages import LogTransforms
+from pipeline.extract.transforms import Limits
+from pipeline.extract.units import in_true_units
+from pipeline.logs.reader import MissionLog
+from pipeline.tables import Frame
+
+
+def rows_in_frame(
+    log: MissionLog, readers: Sequence[ChannelReader], config: ExtractConfig, counts: Counter[str], suspicions: Suspicions,
+    transforms: LogTransforms,
+) -> tuple[dict[str, Positions], Frame]:  # fmt: skip
+    """The rows of every role, placed in the mission frame and thinned, and that frame."""
+    parts = {role: _numbered([(reader, reader.finish()) for reader in readers if reader.role == role]) for role in ROLES}
+    parts = without_set_back(parts, suspicions)
+    timed, clock = on_one_clock(parts, suspicions)
+    rows = {role: _columns(_in_place(role, parts[role], timed[role], suspicions), counts) for role in ROLES}
+    primary = "truth" if config.thinning.enabled and config.thinning.thin_from == "truth" else "detections"
+    _check_any(primary, rows[primary], counts, suspicions)
+    rows = without_unjoined(rows, primary, suspicions)
+    placing = Placing(config.frame, Limits(config.max_extrapolation_s, config.max_transform_gap_s))
+    read_tree = partial(transforms.read, clock)
+    if config.frame is None:
+        check_joined(rows[primary], primary, transforms, read_tree, log, suspicions)
+    rows = bring_together(rows, primary, placing, read_tree, counts)
+    _check_any(primary, rows[primary], counts, suspicions)
+    rows = {role: in_enu(positions) for role, positions in rows.items()}
+    frame = mission_frame(rows[primary], [rows[role] for role in ROLES if role != primary], config.datum)
+    rows = {role: _placed(role, rows[role], frame, counts, transforms.apart) for role in ROLES}
+    rows["detections"] = _identified(rows["detections"], readers, config.simultaneity_s, suspicions)
+    rows = {role: _without_spikes(rows[role], config.max_speed_mps, counts) for role in ROLES}
+    if config.thinning.enabled:
+        rows["detections"] = _thinned(rows[primary], config.thinning)
+        if len(rows["detections"]) == 0:
+            raise InputError("thinning left no detection; choose a smaller extract.thinning.mean_gap_s or another seed")
+    return rows, frame
+
+
+def _identified(rows: Positions, readers: Sequence[ChannelReader], tolerance_s: float, suspicions: Suspicions) -> Positions:
+    """Detections, each counted once, with names that can be meant."""
+    of_detections = [reader for reader in readers if reader.role == "detections"]
+    naming = Naming(
+        believed={reader.channel.topic for reader in of_detections if reader.source.has_identity},
+        topical={reader.channel.topic for reader in of_detections if reader.names["agent"] is not None},
+    )
+    suggested = {reader.channel.topic: reader.channel.schema_name for reader in of_detections if not reader.is_stated}
+    rows = without_false_names(rows, tolerance_s, naming, suspicions)
+    rows = without_other_stages(rows, suggested, suspicions)
+    return without_reused_names(rows, tolerance_s, naming, suspicions)
+
+
+def _columns(parts: Sequence[Positions], counts: Counter[str]) -> Positions:
+    """All finite rows of a role, sorted by time."""
+    counts["out_of_order"] += sum(int((part.time_ns < np.maximum.accumulate(part.time_ns)).sum()) for part in parts)
+    rows = Positions.concatenate(list(parts) or [Rows().finish()])
+    is_finite = np.isfinite(rows.first) & np.isfinite(rows.second)
+    # A latitude off the earth is as little a position as NaN.
+    is_finite &= ~rows.is_geodetic | ((np.abs(rows.first) <= 90) & (np.abs(rows.second) <= 360))
+    counts["dropped_nonfinite"] += int((~is_finite).sum())
+    rows = rows[is_finite]
+    return rows[np.argsort(rows.time_ns, kind="stable")]
+
+
+def _numbered(parts: Sequence[tuple[ChannelReader, Positions]]) -> list[tuple[ChannelReader, Positions]]:
+    """The rows of each reader, with numbers of messages that no other reader has."""
+    sizes = [int(part.message.max(initial=0)) for _, part in parts]
+    return [
+        (reader, replace(part, message=part.message + before))
+        for (reader, part), before in zip(parts, itertools.accumulate(sizes, initial=0), strict=False)
+    ]
+
+
+def _in_place(
+    role: str, parts: Sequence[tuple[ChannelReader, Positions]], timed: Sequence[Positions], suspicions: Suspicions
+) -> list[Positions]:
+    """The rows of each reader, whose times are mended, in true units and without fill-ins."""
+    found = [in_true_units(reader.source, role, rows, suspicions) for (reader, _), rows in zip(parts, timed, strict=True)]
+    return [without_fill_ins(rows, role, suspicions) for rows in found]
+
+
+def _check_any(role: str, rows: Positions, counts: Counter[str], suspicions: Suspicions) -> None:
+    if len(rows):
+        return
+    if suspicions:
+        reason = f"nothing that can be meant is left of the {role}: {'; '.join(few(suspicions.lines()))}"
+    elif counts["no_transform"]:
+        reason = (
+            f"for none of the {role} the log has a transform near enough in time; "
+            "raise extract.max_extrapolation_s and extract.max_transform_gap_s, or check the stamps"
+        )
+    elif counts["dropped_nonfinite"]:
+        reason = "every position is NaN, infinite or off the earth; check the recorder, or map another topic"
+    elif counts["undecodable"]:
+        reason = "no message of the mapped topics can be decoded; map another topic (cadence info lists them)"
+    elif counts["unmet"]:
+        reason = "no position meets the conditions of `where`; correct the [extract] entries"
+    elif counts["no_fix"]:
+        reason = "every position is marked as having no fix; map another topic (cadence info lists them)"
+    elif counts["incomplete"]:
+        reason = "no message of the mapped topics has a position where the mapping looks for it; correct the [extract] entries"
+    elif counts["outside_time_cut"]:
+        raise NothingDetectedError("no message of the mapped topics lies inside extract.start and extract.end; widen them")
+    else:
+        raise NothingDetectedError(f"the topics mapped as {role} hold no position; map another topic (cadence info lists them)")
+    raise InputError(reason)
+
+
+def _placed(role: str, rows: Positions, frame: Frame, counts: Counter[str], apart: set[str]) -> Positions:
+    """Rows in the mission frame. What the user asked for must fit; what was only suggested is left out and counted.
+
+    The frames of what is left out are added to `apart`.
+    """
+    placed, num_elsewhere = place(rows, frame)
+    if num_elsewhere:
+        geodetic = {"latitude and longitude"} if (rows.is_geodetic & (not frame.is_georeferenced)).any() else set()
+        apart |= geodetic | {str(name) for name in rows.frame_id[~rows.is_geodetic]} - {frame.frame_id, ""}
+    if num_elsewhere and rows.is_stated.any():
+        raise InputError(
+            f"{role}: {num_elsewhere} positions are not in the mission frame {frame.frame_id!r}, and no transform of the log "
+            f"joins them; take those topics out of [[extract.{role}]]"
+        )
+    counts["other_frame"] += num_elsewhere
+    return placed
+
+
+def _without_spikes(rows: Positions, max_speed_mps: float | None, counts: Counter[str]) -> Positions:
+    if max_speed_mps is None:
+        return rows
+    spikes = is_spike(rows, max_speed_mps)
+    counts["spikes"] += int(spikes.sum())
+    return rows[~spikes]
+
+
+def _thinned(rows: Positions, config: ThinningConfig) -> Positions:
+    """The rows that fall into bursts, with noise."""
+    if any(agent is None for agent in rows.agent):
+        raise InputError(
+            "thinning: some detections have no agent; give agent or agent_path, or set extract.thinning.enabled=false"
+        )
+    is_kept = np.zeros(len(rows), dtype=np.bool_)
+    first, second = rows.first.copy(), rows.second.copy()
+    for agent in sorted(set(rows.agent)):
+        of_agent = np.flatnonzero(rows.agent == agent)
+        is_kept[of_agent] = is_seen(rows.time_ns[of_agent], agent, config)
+        if config.noise_m > 0:
+            added = noise(len(of_agent), agent, config)
+            first[of_agent] += added[:, 0]
+            second[of_agent] += added[:, 1]
+    covariance = rows.covariance_m2
+    if config.variance_m2 > 0:
+        covariance = np.nan_to_num(covariance, nan=0.0) + np.array([config.variance_m2, 0.0, config.variance_m2])
+    return replace(rows, first=first, second=second, covariance_m2=covariance)[is_kept]
