@@ -14,6 +14,13 @@ from typing import Any
 
 PROJECT = Path(__file__).resolve().parents[1] / "pyproject.toml"
 TABLE = "tool.cadence.coverage_floors"
+RECORDINGS = PROJECT.parent.parent / "shared" / "data"
+
+ROOM = 0.5
+"""Points that machines may differ by: some lines are for what only some processors or schedules do."""
+
+ROOM_WITHOUT_RECORDINGS = 3.0
+"""Tests that need recorded logs are skipped where there are none."""
 
 
 def measured_percent(report: Mapping[str, Any]) -> dict[str, float]:
@@ -27,13 +34,13 @@ def measured_percent(report: Mapping[str, Any]) -> dict[str, float]:
     return {folder: 100.0 * covered[folder] / count for folder, count in sorted(statements.items()) if count}
 
 
-def complaints(measured: Mapping[str, float], floors: Mapping[str, int]) -> list[str]:
-    """One line for each package that is below its floor or has none, and for each floor without a package."""
+def complaints(measured: Mapping[str, float], floors: Mapping[str, int], room: float = 0.0) -> list[str]:
+    """One line for each package that is more than `room` below its floor or has none, and for each floor without a package."""
     found = []
     for package, percent in measured.items():
         if package not in floors:
             found.append(f'{package}: no floor; add "{package}" = {int(percent)} to [{TABLE}]')
-        elif percent < floors[package]:
+        elif percent < floors[package] - room:
             found.append(f"{package}: {percent:.1f} % of its lines are tested, the floor is {floors[package]} %; add tests")
     gone = floors.keys() - measured.keys()
     return found + [f"{package}: there is no such package; take its floor out of [{TABLE}]" for package in sorted(gone)]
@@ -61,7 +68,10 @@ def main(report: Path, *options: str) -> int:
     floors = floors_of(PROJECT.read_text(encoding="utf-8"))
     for package, percent in measured.items():
         print(f"{package:<26} {percent:6.2f} %   floor {floors.get(package, '-')}")
-    wrong = complaints(measured, floors)
+    has_recordings = RECORDINGS.is_dir()
+    if not has_recordings:
+        print(f"No recorded logs in ../shared/data: floors are held with {ROOM_WITHOUT_RECORDINGS:g} points of room.")
+    wrong = complaints(measured, floors, ROOM if has_recordings else ROOM_WITHOUT_RECORDINGS)
     print("\n".join(wrong), file=sys.stderr)
     return 1 if wrong else 0
 
