@@ -207,3 +207,9 @@ def test_paths_may_hold_their_topic_as_in_foxglove() -> None:
 def test_no_known_type_and_no_paths() -> None:
     with pytest.raises(ConfigError, match=r"its type, my.Own, is not known; give message paths"):
         resolve_paths(SourceConfig("/a"), "my.Own")
+
+
+def test_the_older_name_of_a_message_type_is_still_read() -> None:
+    assert SourceConfig("/fix", preset="NavSatFix") == SourceConfig("/fix", message_type="NavSatFix")
+    with pytest.raises(ValueError, match="older name of message_type"):
+        SourceConfig("/fix", preset="NavSatFix", message_type="NavSatFix")
