@@ -36,7 +36,7 @@ FLOORS = {
     ),
     "pipeline": (
         {"documents", "out_of_memory", "suggestions"},
-        {"arrays", "config", "locks", "progress", "provenance", "plain_rows", "obstacle_file", "score_words"},
+        {"arrays", "config", "locks", "progress", "provenance", "plain_rows", "presence", "obstacle_file", "score_words"},
         {"files"},
         {"manifest", "tables"},
         {"frames", "stores", "logs", "mapping", "tracks"},

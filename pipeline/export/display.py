@@ -11,6 +11,7 @@ import numpy as np
 from pipeline.arrays import Float64s, Int64s
 from pipeline.export.playback import LiveAgent, Scene
 from pipeline.export.scene import Entity, Label, Lines, LineType, Spheres, round_positions
+from pipeline.presence import with_presence
 
 # Okabe and Ito (2008), "Color Universal Design": told apart with any colour vision; black is left out (dark backgrounds).
 PALETTE = ("#56B4E9", "#E69F00", "#009E73", "#F0E442", "#CC79A7", "#D55E00", "#0072B2")
@@ -103,11 +104,12 @@ def scene_entities(drawing: Drawing | None, time_ns: int, marks: Sequence[Marks]
 def _agent_entity(live: LiveAgent, lines: tuple[Lines, ...], time_ns: int, style: Style) -> Entity:
     color = style.color(live.agent.agent_id)
     now_m = style.place(live.weight @ live.at(time_ns))
+    called = with_presence(live.agent.agent_id, live.agent.probability)
     return Entity(
         f"agent/{live.agent.agent_id}",
         lines=lines,
         spheres=(Spheres(now_m[None], style.extent_m * 0.012, np.array([*color[:3], 0.8])),),
-        labels=(Label(now_m + np.array([0.0, style.extent_m * 0.015, 0.0]), live.agent.agent_id, color),),
+        labels=(Label(now_m + np.array([0.0, style.extent_m * 0.015, 0.0]), called, color),),
     )
 
 

@@ -13,6 +13,7 @@ from pipeline.export.display import Style
 from pipeline.export.playback import LiveAgent, Scene
 from pipeline.frames import to_geodetic
 from pipeline.logs.writer import foxglove_class
+from pipeline.presence import with_presence
 from pipeline.tables import Frame
 from pipeline.tracks import UNKNOWN_AGENT
 
@@ -65,7 +66,7 @@ def encode_map(scene: Scene, frame: Frame, style: Style) -> bytes:
     features = []
     for live in scene.live:
         hue = style.hue(live.agent.agent_id)
-        name = live.agent.agent_id
+        name = with_presence(live.agent.agent_id, live.agent.probability)
         for share in _SHARES:
             style_90 = {"color": hue, "weight": 1, "opacity": 0.6, "fillColor": hue, "fillOpacity": 0.25 - 0.15 * share}
             features.append(_feature(_region(live, share), frame, f"{name} {share:.0%}", style_90))

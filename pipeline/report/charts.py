@@ -98,9 +98,11 @@ def _chart_row(
     axis: TimeAxis,
     spread: SpreadAxis,
 ) -> str:
-    name = mission.agents[agent]
+    name, called = mission.agents[agent], mission.called(agent, rows)
     short = name if len(name) <= 18 else name[:17] + "…"
-    parts = [f'<text class="name" x="0" y="14"><title>{escape(name)}</title>{escape(short)}</text>']
+    parts = [f'<text class="name" x="0" y="14"><title>{escape(called)}</title>{escape(short)}</text>']
+    if called != name:
+        parts.append(f'<text class="unit" x="0" y="28">{escape(called.removeprefix(name).strip(" ()"))}</text>')
     right = CHART_WIDTH - MARGIN_RIGHT
     x = axis.pixels(np.array([row.origin_ns for row in rows], dtype=np.int64))
     found = [place.get((row.window, row.agent)) for row in rows]

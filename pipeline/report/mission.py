@@ -19,6 +19,7 @@ from pipeline.documents import parse_json
 from pipeline.files import hash_file
 from pipeline.manifest import read_manifest
 from pipeline.obstacle_file import OBSTACLES_NAME, read_obstacle_entries
+from pipeline.presence import with_presence
 from pipeline.report.origins import Origins, origins_of, with_likeliest
 from pipeline.results import AgentHypotheses, MissionHypotheses, WindowHypotheses, read_hypothesis_tables
 from pipeline.tables import Frame, read_table
@@ -92,6 +93,7 @@ class WindowRow:
     num_detections: int
     age_s: float | None
     spread_m: float | None
+    probability: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,10 +135,15 @@ class Mission:
     log_end_ns: int
     origins: Origins | None = None
 
+    def called(self, agent: int, rows: Iterable[WindowRow]) -> str:
+        """The agent's name with how likely it is there: the largest probability among `rows`, which are its own."""
+        found = [row.probability for row in rows if row.probability is not None]
+        return with_presence(self.agents[agent], max(found, default=None))
+
     @property
     def num_tracked(self) -> int:
-        """Agents that infer has looked at; the others are only in the truth."""
-        return len({row.agent for row in self.rows})
+        """Agents that have hypotheses; the others are only in the truth, or of them nothing can be said."""
+        return len({fan.agent for fan in self.fans})
 
     @property
     def drawn_windows(self) -> list[int]:
@@ -263,7 +270,7 @@ def _window_rows(found: MissionHypotheses, agents: tuple[str, ...]) -> tuple[Win
     return tuple(
         WindowRow(
             window.window, place[agent.agent_id], window.origin_ns, agent.status, agent.advice or "", agent.num_detections,
-            agent.age_s, agent.spread_m,
+            agent.age_s, agent.spread_m, agent.probability,
         )
         for window in found.windows
         for agent in sorted(window.agents, key=lambda agent: place[agent.agent_id])

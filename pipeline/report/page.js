@@ -240,8 +240,14 @@
     if (layers.mean) inMetres(() => visible.forEach((fan) => drawMean(fan, colour)));
     if (layers.detections) drawDetections(colour);
     visible.forEach((fan) => drawNow(fan, colour, visible.length));
-    if (layers.names) visible.forEach((fan) => { const [x, y] = nowOf(fan); label(data.agents[fan.agent], x + 9, y - 7, colour.text, colour); });
+    if (layers.names) visible.forEach((fan) => { const [x, y] = nowOf(fan); label(data.agents[fan.agent] + (there(fan.agent) && ` (there: ${there(fan.agent)})`), x + 9, y - 7, colour.text, colour); });
     drawFurniture(colour);
+  }
+
+  // How likely an agent is there at all in the window shown; nothing where the log says who was seen.
+  function there(agent) {
+    const probability = ((data.cells[state.window] ?? [])[agent] ?? [])[4] ?? null;
+    return probability === null ? "" : `${probability > 0.99 ? "> 99" : Math.round(100 * probability)} %`;
   }
 
   function niceLength(length) {
@@ -420,8 +426,8 @@
     const words = data.window.length ? `${clock(seconds)} · window ${data.window[state.window]}` : "no windows";
     moment.textContent = words; slider.setAttribute("aria-valuetext", words);
     cellTexts.forEach((text, agent) => {
-      const [status, count, age, spread] = (data.cells[state.window] ?? [])[agent] ?? ["", 0, null, null];
-      text.textContent = status && spread === null ? status.replaceAll("_", " ") : count === 0 && spread === null ? "no detections" : `±${metres(spread ?? 0)}, ${period(age ?? 0)}`;
+      const [status, count, age, spread] = (data.cells[state.window] ?? [])[agent] ?? ["", 0, null, null, null];
+      text.textContent = there(agent) + (there(agent) && ", ") + (status && spread === null ? status.replaceAll("_", " ") : count === 0 && spread === null ? "no detections" : `±${metres(spread ?? 0)}, ${period(age ?? 0)}`);
     });
     for (const chart of document.querySelectorAll("svg.chart")) {
       const x = (Number(chart.dataset.left) + seconds * Number(chart.dataset.scale)).toFixed(1), cursor = chart.querySelector(".cursor");

@@ -97,9 +97,11 @@ def _facts(mission: Mission) -> list[tuple[str, str, str]]:
     if UNKNOWN_AGENT in mission.agents:
         is_unknown |= mission.detections.owner == mission.agents.index(UNKNOWN_AGENT)
     unknown = int(is_unknown.sum()) if mission.origins is None else mission.origins.num_detections
-    others = len(mission.agents) - mission.num_tracked
+    num_seen = len({row.agent for row in mission.rows})
+    others = {"only in the truth": len(mission.agents) - num_seen, "without hypotheses": num_seen - mission.num_tracked}
+    more = ", ".join(f"{count:,} more {words}" for words, count in others.items() if count)
     facts = [
-        ("Agents", f"{mission.num_tracked:,}", f"{others:,} more only in the truth" if others else ""),
+        ("Agents", f"{mission.num_tracked:,}", more),
         ("Detections", f"{len(mission.detections):,}", f"{unknown:,} without a known agent" if unknown else ""),
     ]
     if not mission.fans:

@@ -116,8 +116,8 @@ def _seconds(mission: Mission, time_ns: int) -> float:
 
 def _cell(row: WindowRow | None) -> list[Any]:
     if row is None:
-        return ["", 0, None, None]
-    rounded = [None if value is None else float(f"{value:.4g}") for value in (row.age_s, row.spread_m)]
+        return ["", 0, None, None, None]
+    rounded = [None if value is None else float(f"{value:.4g}") for value in (row.age_s, row.spread_m, row.probability)]
     return ["" if row.status == "ok" else row.status, row.num_detections, *rounded]
 
 

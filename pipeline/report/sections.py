@@ -24,13 +24,14 @@ def moments_section(mission: Mission, analysis: Analysis, moments: Sequence[Mome
     if not moments:
         return ""
     clock = Clock(mission.start_ns, mission.end_ns)
-    ages = {(row.window, row.agent): row.age_s for row in mission.rows}
+    rows = {(row.window, row.agent): row for row in mission.rows}
     share = shown_share(mission)
     figures = []
     for moment in moments:
         fan = mission.fans[moment.fan]
-        age, error_m = ages.get((fan.window, fan.agent)), analysis.error_now_m[moment.fan]
-        words = [f"{mission.agents[fan.agent]} at {clock.moment(fan.origin_ns)}"]
+        row, error_m = rows.get((fan.window, fan.agent)), analysis.error_now_m[moment.fan]
+        age = None if row is None else row.age_s
+        words = [f"{mission.called(fan.agent, [row] if row else [])} at {clock.moment(fan.origin_ns)}"]
         words += [f"spread {metres(analysis.spread_now_m[moment.fan])}"]
         words += [f"last seen {duration(age)} before"] if age is not None else []
         words += [f"mean {metres(error_m)} from truth"] if np.isfinite(error_m) else []
@@ -116,7 +117,8 @@ def _trouble_table(mission: Mission, runs: Mapping[int, Sequence[Trouble]]) -> s
         spans = ", ".join(words[:MAX_RUNS]) + (f" and {len(words) - MAX_RUNS} more" if len(words) > MAX_RUNS else "")
         numbers = ", ".join(" to ".join(str(row.window) for row in _ends(trouble)) for trouble in found[:MAX_RUNS])
         numbers += ", …" if len(found) > MAX_RUNS else ""
-        rows.append([text(mission.agents[agent]), str(sum(trouble.count for trouble in found)), text(numbers), text(spans)])
+        name = mission.called(agent, [row for trouble in found for row in _ends(trouble)])
+        rows.append([text(name), str(sum(trouble.count for trouble in found)), text(numbers), text(spans)])
     body = table(heads, rows[:OPEN_ROWS], numeric=(1,))
     if len(rows) > OPEN_ROWS:
         rest = table(heads, rows[OPEN_ROWS:MAX_ROWS], numeric=(1,))

@@ -21,6 +21,7 @@ from fixtures.mission import (
     START_NS,
     STRIDE_NS,
     build_mission,
+    make_uncertain,
 )
 from fixtures.side_files import read_hypotheses
 from foxglove_schemas_protobuf.GeoJSON_pb2 import GeoJSON
@@ -478,3 +479,15 @@ def test_rerun_accepts_the_files(tmp_path):
         for kind in ("cadence", "combined"):
             command = [rerun, "mcap", "check", "--full", directory / f"patrol.{kind}.mcap"]
             subprocess.run(command, check=True, capture_output=True, timeout=60)
+
+
+def test_how_likely_an_agent_is_there_stands_beside_its_name(tmp_path):
+    directory = build_mission(tmp_path, frame=GEOREFERENCED)
+    make_uncertain(directory, {"T0": 0.996, "T1": 0.62})
+    export(directory, CONFIG, QUIET)
+    scenes = [scene for _, scene in messages(directory, "/cadence/scene", SceneUpdate)]
+    texts = {label.text for scene in scenes for entity in scene.entities for label in entity.texts}
+    assert texts == {"T0 (there: > 99 %)", "T1 (there: 62 %)"}
+    maps = [json.loads(message.geojson) for _, message in messages(directory, "/cadence/map", GeoJSON)]
+    names = {feature["properties"]["name"] for each in maps for feature in each["features"]}
+    assert {name.partition(")")[0] + ")" for name in names} == texts

@@ -11,7 +11,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 import pytest
-from fixtures.mission import GEOREFERENCED, build_mission, rename_agents
+from fixtures.mission import GEOREFERENCED, build_mission, make_uncertain, rename_agents
 
 from cadence.errors import InputError
 from pipeline.progress import Progress
@@ -306,3 +306,13 @@ def test_scores_of_evaluate_are_shown_unless_they_are_of_other_hypotheses(missio
 def test_config_refuses_nonsense() -> None:
     with pytest.raises(ValueError, match="max_megabytes"):
         ReportConfig(max_megabytes=0)
+
+
+def test_how_likely_an_agent_is_there_stands_beside_its_name(mission: Path) -> None:
+    assert "(there:" not in Page(make(mission)).text
+    make_uncertain(mission, {"T1": 0.62})
+    page = Page(make(mission))
+    assert {cell[4] for cells in page.data["cells"] for cell in cells} == {None, 0.62}
+    drawn = [words for words in page.text.split("On the map") if " at " in words]
+    assert any("T1 (there: 62 %) at" in words for words in drawn) and "T0 (there" not in page.text
+    assert "there: 62 %" in make(mission).partition('class="chart"')[2]
