@@ -10,7 +10,8 @@ from typing import Final
 
 import numpy as np
 
-from pipeline.arrays import Bools, Float64s, Int64s
+from pipeline.arrays import Bools, Float64s, Int64s, Objects
+from pipeline.extract.positions import numbered
 
 AHEAD_S: Final = 2.0
 """A message cannot be logged before the moment it tells of, and the clocks of one vehicle agree better than this."""
@@ -45,13 +46,13 @@ _FIRST_LOG_NS: Final = 631_152_000 * 10**9
 class Stamps:
     """What one source says of time, in the order in which it was logged.
 
-    time_ns, log_time_ns [N]; place [N, D] is what moves; who [N] numbers whose it is (empty: all of one)
+    time_ns, log_time_ns [N]; place [N, D] is what moves; who [N] tells whose it is (empty: all of one)
     """
 
     time_ns: Int64s
     log_time_ns: Int64s
     place: Float64s
-    who: Int64s = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    who: Objects = field(default_factory=lambda: np.zeros(0, dtype=object))
 
     def __len__(self) -> int:
         return len(self.time_ns)
@@ -111,6 +112,8 @@ def judge(stamps: Stamps) -> Judgement:
     no_row = np.zeros(len(stamps), np.bool_)
     if len(stamps) < MIN_ROWS:
         return Judgement(None, "", ~no_row, no_row)
+    if _are_prompt(stamps):
+        return Judgement(Clock(), "", ~no_row, no_row)
     is_standing, fault = _standing(stamps)
     unit = _wrong_unit(stamps)
     if is_standing.all() or unit:
@@ -126,6 +129,13 @@ def judge(stamps: Stamps) -> Judgement:
             "; " * bool(fault) + f"{int(is_stray.sum())} of {len(stamps)} stamps are unset or of another clock than the rest"
         )
     return Judgement(clock, fault, ~(is_standing | is_stray), no_row)
+
+
+def _are_prompt(stamps: Stamps) -> bool:
+    """Whether all is as it is in nearly every log: stamps go on, a little behind the log times."""
+    ahead_ns, goes_on = stamps.time_ns - stamps.log_time_ns, np.diff(stamps.log_time_ns) > 0
+    is_near = stamps.time_ns.min() >= 0 and ahead_ns.min() >= -LATE_S * 1e9 and ahead_ns.max() <= AHEAD_S * 1e9
+    return bool(is_near and not ((np.diff(stamps.time_ns) == 0) & goes_on).any())
 
 
 def strays(stamps: Stamps, clock: Clock) -> Bools:
@@ -156,8 +166,9 @@ def _standing(stamps: Stamps) -> tuple[Bools, str]:
     """
     order, is_next = np.arange(len(stamps)), np.ones(len(stamps) - 1, np.bool_)
     if len(stamps.who):
-        order = np.argsort(stamps.who, kind="stable")
-        is_next = stamps.who[order][1:] == stamps.who[order][:-1]
+        who = numbered(stamps.who)
+        order = np.argsort(who, kind="stable")
+        is_next = who[order][1:] == who[order][:-1]
     step_s = np.diff(stamps.time_ns[order]).astype(np.float64) * 1e-9
     log_s = np.diff(stamps.log_time_ns[order]).astype(np.float64) * 1e-9 * is_next
     stays = is_next & (step_s == 0)

@@ -57,8 +57,7 @@ def collapse(positions: Positions, tolerance_s: float) -> Collapsed:
 
 def _groups(positions: Positions, tolerance_ns: int) -> Iterator[Int64s]:
     """Row numbers of every group of two or more."""
-    for agent in sorted({agent for agent in positions.agent if agent is not None}):
-        rows = np.flatnonzero(positions.agent == agent)
+    for rows in positions.agents.rows():
         times = positions.time_ns[rows]
         if not (np.diff(times) <= tolerance_ns).any():
             continue
@@ -74,7 +73,7 @@ def _groups(positions: Positions, tolerance_ns: int) -> Iterator[Int64s]:
 
 def _copies(positions: Positions) -> Iterator[Int64s]:
     """Row numbers of every group of detections of unknown origin that are one detection, told several times."""
-    rows = np.flatnonzero(positions.agent == None)  # noqa: E711 (elementwise)
+    rows = np.flatnonzero(positions.agents.number < 0)
     columns = (positions.second[rows], positions.first[rows], positions.time_ns[rows])
     rows = rows[np.lexsort(columns)]
     is_same = np.ones(max(len(rows) - 1, 0), np.bool_)

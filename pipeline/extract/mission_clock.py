@@ -12,7 +12,7 @@ import numpy as np
 from pipeline.arrays import Bools, Int64s
 from pipeline.extract.clocks import MIN_ROWS, Clock, Judgement, Stamps, judge, strays
 from pipeline.extract.plausibility import Suspicions
-from pipeline.extract.positions import ChannelReader, Positions, numbered
+from pipeline.extract.positions import ChannelReader, Positions
 from pipeline.mapping.sources import LOG_TIME, PUBLISH_TIME
 
 TRUSTED = 'extract.trusted = ["time"]'
@@ -63,9 +63,7 @@ def on_one_clock(
             if reader.source.time in (LOG_TIME, PUBLISH_TIME):
                 clocks.append(Clock())
             elif len(rows):
-                stamps = Stamps(
-                    rows.time_ns, rows.log_time_ns, np.column_stack([rows.first, rows.second]), numbered(rows.agent)
-                )
+                stamps = Stamps(rows.time_ns, rows.log_time_ns, np.column_stack([rows.first, rows.second]), rows.agent)
                 judged[id(reader)] = stamps, judge(stamps)
                 clocks += [clock for clock in [judged[id(reader)][1].clock] if clock is not None]
     is_shared = bool(clocks) and all(clock.agrees_with(clocks[0]) for clock in clocks)

@@ -3,6 +3,7 @@
 A name is believed as long as nothing contradicts it. What does, is said as a suspicion.
 """
 
+import itertools
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, replace
 from typing import Final
@@ -13,7 +14,7 @@ from scipy.spatial import cKDTree
 from pipeline.arrays import Bools, Int64s
 from pipeline.extract.covariances import are_apart
 from pipeline.extract.plausibility import Suspicions, listed
-from pipeline.extract.positions import Positions, numbered
+from pipeline.extract.positions import Positions
 
 _MAX_SHARED: Final = 0.05
 """Of the messages that hold a name: with more in which it stands at several places it is no name at all; with fewer the odd
@@ -54,25 +55,26 @@ def without_false_names(rows: Positions, tolerance_s: float, naming: Naming, sus
         return rows
     rows = _without_shared(rows, naming, round(tolerance_s * 1e9), suspicions)
     agent = rows.agent.copy()
-    for topic in dict.fromkeys(rows.topic):
+    for topic, of_topic in zip(rows.topics.names, rows.topics.rows(), strict=True):
         if topic in naming.believed or topic in naming.topical:
             continue
-        chosen = np.flatnonzero((rows.topic == topic) & (rows.agent != None))  # noqa: E711 (elementwise)
+        chosen = of_topic[rows.agents.number[of_topic] >= 0]
         for is_false, seen in _faults(rows[chosen]):
             agent[chosen[is_false]] = None
-            _suspect(str(topic), seen, int(is_false.sum()), suspicions)
-    return replace(rows, agent=agent)
+            _suspect(topic, seen, int(is_false.sum()), suspicions)
+    return rows if (agent == rows.agent).all() else replace(rows, agent=agent)
 
 
 def _faults(rows: Positions) -> Iterator[tuple[Bools, str]]:
     """Which rows [N] of a topic bear no name, and why, for each reason that there is."""
-    names = list(dict.fromkeys(rows.agent))
-    for chosen, why in (
-        ([name for name in names if _is_fill_in(name)], "what stands where nothing was filled in"),
-        ([name for name in names if name.lower() in _CLASSES], "what was seen, not who"),
+    names = rows.agents.names
+    for is_chosen, why in (
+        ([_is_fill_in(name) for name in names], "what stands where nothing was filled in"),
+        ([name.lower() in _CLASSES for name in names], "what was seen, not who"),
     ):
+        chosen = list(itertools.compress(names, is_chosen))
         if chosen:
-            yield np.isin(rows.agent.astype(np.str_), chosen), f"{listed(chosen)} {'are' if len(chosen) > 1 else 'is'} {why}"
+            yield np.array(is_chosen)[rows.agents.number], f"{listed(chosen)} {'are' if len(chosen) > 1 else 'is'} {why}"
     if _are_fresh(rows):
         yield np.ones(len(rows), np.bool_), f"{len(names)} names for {len(rows)} detections: they are new in each message"
 
@@ -84,11 +86,11 @@ def _is_fill_in(name: str) -> bool:
 
 def _are_fresh(rows: Positions) -> bool:
     """Whether names last for one message each, while targets do not."""
-    number = numbered(rows.agent)
-    if len(rows) == 0 or number.max() + 1 < _MIN_FRESH or len(np.unique(rows.message)) < _MIN_FRESH:
+    num_names = len(rows.agents.names)
+    if num_names < _MIN_FRESH or len(np.unique(rows.message)) < _MIN_FRESH:
         return False
-    pairs = np.unique(np.column_stack([number, rows.message]), axis=0)
-    if (np.bincount(pairs[:, 0]) == 1).mean() < _FRESH:
+    pairs = np.unique(np.column_stack([rows.agents.number, rows.message]), axis=0)
+    if (np.bincount(pairs[:, 0], minlength=num_names) == 1).mean() < _FRESH:
         return False
     _, message = np.unique(rows.message, return_inverse=True)
     return float(np.median(_speeds_mps(rows, message))) < _FRESH_MPS
@@ -109,29 +111,40 @@ def _speeds_mps(rows: Positions, message: Int64s) -> np.ndarray:
 
 def _without_shared(rows: Positions, naming: Naming, tolerance_ns: int, suspicions: Suspicions) -> Positions:
     """Take names away that one message gives to several places at one moment."""
+    is_shared = _is_shared(rows, tolerance_ns)
+    if not is_shared.any():
+        return rows
     agent = rows.agent.copy()
-    is_shared = _is_shared(rows, tolerance_ns) & np.array([topic not in naming.believed for topic in rows.topic], np.bool_)
-    for topic in dict.fromkeys(rows.topic[is_shared]):
-        of_topic = rows.topic == topic
-        names = list(dict.fromkeys(rows.agent[of_topic & is_shared]))
+    for topic, of_topic in zip(rows.topics.names, rows.topics.rows(), strict=True):
+        shared = of_topic[is_shared[of_topic]]
+        if topic in naming.believed or len(shared) == 0:
+            continue
         is_false = np.zeros(len(rows), np.bool_)
-        for name in names:
-            of_name = of_topic & (rows.agent == name)
-            num_shared, num_messages = (len(np.unique(rows.message[found])) for found in (of_name & is_shared, of_name))
-            is_false |= of_name if num_shared > _MAX_SHARED * num_messages else of_name & is_shared
+        numbers = list(dict.fromkeys(rows.agents.number[shared].tolist()))
+        for number in numbers:
+            of_name = of_topic[rows.agents.number[of_topic] == number]
+            shares_name = of_name[is_shared[of_name]]
+            is_false[
+                of_name if _num_messages(rows, shares_name) > _MAX_SHARED * _num_messages(rows, of_name) else shares_name
+            ] = True
         agent[is_false] = None
-        num_messages = len(np.unique(rows.message[of_topic & is_shared]))
-        seen = f"{num_messages} of {len(np.unique(rows.message[of_topic]))} messages have {listed(names)} at several places"
-        _suspect(str(topic), seen, int(is_false.sum()), suspicions)
+        names = listed([rows.agents.names[number] for number in numbers])
+        seen = f"{_num_messages(rows, shared)} of {_num_messages(rows, of_topic)} messages have {names} at several places"
+        _suspect(topic, seen, int(is_false.sum()), suspicions)
     return replace(rows, agent=agent)
+
+
+def _num_messages(rows: Positions, chosen: Int64s) -> int:
+    return len(np.unique(rows.message[chosen]))
 
 
 def _is_shared(rows: Positions, tolerance_ns: int) -> Bools:
     """Which rows [N] bear a name that another row of the same message and moment bears at a place that does not agree."""
     found = np.zeros(len(rows), np.bool_)
-    name = numbered(rows.agent)
-    named = np.flatnonzero(name >= 0)
-    name = name[named]
+    named = np.flatnonzero(rows.agents.number >= 0)
+    if len(named) == 0 or np.bincount(rows.message[named]).max() < 2:
+        return found
+    name = rows.agents.number[named]
     order = np.lexsort((rows.time_ns[named], name, rows.message[named]))
     name, ordered = name[order], named[order]
     before, after = ordered[:-1], ordered[1:]

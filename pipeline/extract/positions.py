@@ -3,17 +3,17 @@
 What cannot be used is counted, never passed on in silence.
 """
 
+import itertools
 import json
 import math
 from array import array
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import Any, Self
 
 import numpy as np
-import pyarrow as pa
 
 from cadence.errors import ConfigError
 from pipeline.arrays import Bools, Column, Float32s, Float64s, Int64s, Objects
@@ -74,7 +74,19 @@ class Positions:
 
     def __getitem__(self, rows: Any) -> Self:
         """The rows of a mask, of indices or of a slice."""
+        if isinstance(rows, np.ndarray) and rows.dtype == np.bool_ and rows.all():
+            return self
         return type(self)(*(getattr(self, item.name)[rows] for item in fields(self)))
+
+    @cached_property
+    def agents(self) -> "Names":
+        """The agents by number."""
+        return Names.of(self.agent)
+
+    @cached_property
+    def topics(self) -> "Names":
+        """The topics by number."""
+        return Names.of(self.topic)
 
     @classmethod
     def concatenate(cls, parts: Sequence["Positions"]) -> "Positions":
@@ -82,10 +94,30 @@ class Positions:
         return cls(*(np.concatenate([getattr(part, item.name) for part in parts]) for item in fields(cls)))
 
 
+@dataclass(frozen=True, eq=False)
+class Names:
+    """A column of names as numbers: number [N] is the place of each in `names`, by their first rows; -1 for None."""
+
+    number: Int64s
+    names: tuple[str, ...]
+
+    @staticmethod
+    def of(column: Objects) -> "Names":
+        """The names of a column."""
+        names = tuple(name for name in dict.fromkeys(column) if name is not None)
+        place: dict[str | None, int] = {name: number for number, name in enumerate(names)} | {None: -1}
+        return Names(np.fromiter(map(place.__getitem__, column), np.int64, len(column)), names)
+
+    def rows(self) -> list[Int64s]:
+        """The row numbers of each name, ascending."""
+        order = np.argsort(self.number, kind="stable")
+        ends = np.searchsorted(self.number[order], np.arange(-1, len(self.names)), side="right")
+        return [order[first:last] for first, last in itertools.pairwise(ends.tolist())]
+
+
 def numbered(names: Objects) -> Int64s:
     """Numbers [N] of names, equal where they are; -1 for None."""
-    found = pa.array(names, type=pa.string()).dictionary_encode().indices
-    return np.asarray(found.fill_null(-1).to_numpy(zero_copy_only=False), dtype=np.int64)
+    return Names.of(names).number
 
 
 class Rows:

@@ -4,7 +4,7 @@ A small number that a tracker gives out anew, sensors that count for themselves,
 """
 
 from collections import defaultdict
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Final
 
@@ -13,7 +13,7 @@ import numpy as np
 from pipeline.arrays import Int64s, Objects
 from pipeline.extract.names import Naming
 from pipeline.extract.plausibility import Suspicions, listed
-from pipeline.extract.positions import Positions, numbered
+from pipeline.extract.positions import Names, Positions
 from pipeline.extract.tracks import Jump, Track, apart_m, odd_share, pieces_of
 
 _MAX_ODD: Final = 0.3
@@ -31,6 +31,10 @@ class _Found:
     jumps: dict[str, Jump] = field(default_factory=dict)
     num_agents: int = 0
 
+    def any(self) -> bool:
+        """Whether there is anything to tell."""
+        return bool(self.apart or self.odd or self.jumps)
+
 
 def without_reused_names(rows: Positions, tolerance_s: float, naming: Naming, suspicions: Suspicions) -> Positions:
     """The rows [N] of detections, in metres and sorted by time, with names that mean one agent each.
@@ -41,16 +45,24 @@ def without_reused_names(rows: Positions, tolerance_s: float, naming: Naming, su
     if not suspicions.looks_for("identity") or len(rows) == 0:
         return rows
     agent, found = rows.agent.copy(), defaultdict[str, _Found](_Found)
-    track, names = _track(rows), set(rows.agent)
-    for name, chosen in _by_name(rows):
-        if len(chosen) >= _MIN_ROWS and not any(topic in naming.believed for topic in set(rows.topic[chosen])):
-            told = found[", ".join(dict.fromkeys(rows.topic[chosen]))]
-            sources = _by_source(rows, chosen)
-            for part_name, parts in _apart(track, name, sources, told).items():
-                agent[np.sort(np.concatenate(parts))] = _renamed(track, part_name, parts, tolerance_s, names, told)
+    track, taken, sensors = _track(rows), set(rows.agents.names), Names.of(rows.sensor)
+    sources = rows.topics.number * (len(sensors.names) + 1) + sensors.number
+    is_believed = np.array([topic in naming.believed for topic in rows.topics.names])[rows.topics.number]
+    for name, chosen in zip(rows.agents.names, rows.agents.rows(), strict=True):
+        if len(chosen) < _MIN_ROWS or is_believed[chosen].any():
+            continue
+        parts = {source: chosen[sources[chosen] == source] for source in np.unique(sources[chosen]).tolist()}
+        told = found[", ".join(dict.fromkeys(rows.topic[[part[0] for part in parts.values()]]))]
+        named = {_source(rows, part): part for part in parts.values()}
+        for part_name, same in _apart(track, name, named, told).items():
+            renamed = _renamed(track, part_name, same, tolerance_s, taken, told)
+            if renamed is not None:
+                agent[np.sort(np.concatenate(same))] = renamed
+            elif part_name != name:
+                agent[np.concatenate(same)] = part_name
     for topics, told in found.items():
         _tell(topics, told, suspicions)
-    return replace(rows, agent=agent)
+    return replace(rows, agent=agent) if any(told.any() for told in found.values()) else rows
 
 
 def _track(rows: Positions) -> Track:
@@ -58,20 +70,9 @@ def _track(rows: Positions) -> Track:
     return Track(time_s, rows.first + 1j * rows.second, np.nan_to_num(rows.covariance_m2[:, [0, 2]].max(axis=1)))
 
 
-def _by_name(rows: Positions) -> Iterator[tuple[str, Int64s]]:
-    """Every name and its row numbers."""
-    number = numbered(rows.agent)
-    order = np.argsort(number, kind="stable")
-    for chosen in np.split(order, np.flatnonzero(np.diff(number[order])) + 1):
-        if number[chosen[0]] >= 0:
-            yield str(rows.agent[chosen[0]]), chosen
-
-
-def _by_source(rows: Positions, chosen: Int64s) -> dict[str, Int64s]:
-    """The row numbers of a name by who says so: topic and sensor."""
-    pairs = zip(rows.topic[chosen], rows.sensor[chosen], strict=True)
-    source = np.array([f"{topic.strip('/')} {sensor or ''}".strip() for topic, sensor in pairs], dtype=object)
-    return {each: chosen[source == each] for each in dict.fromkeys(source)}
+def _source(rows: Positions, part: Int64s) -> str:
+    """Who says so: topic and sensor."""
+    return f"{rows.topic[part[0]].strip('/')} {rows.sensor[part[0]] or ''}".strip()
 
 
 def _apart(track: Track, name: str, sources: Mapping[str, Int64s], told: _Found) -> dict[str, list[Int64s]]:
@@ -84,19 +85,20 @@ def _apart(track: Track, name: str, sources: Mapping[str, Int64s], told: _Found)
 
 
 def _renamed(
-    track: Track, name: str, parts: Sequence[Int64s], tolerance_s: float, names: Collection[str], told: _Found
-) -> Objects:
-    """What each row [N] of an agent, seen by several sources, is called; None where nothing is known."""
-    rows = np.sort(np.concatenate(parts))
-    odd = sum(odd_share(track[part], tolerance_s) * len(part) for part in parts)
+    track: Track, name: str, parts: Sequence[Int64s], tolerance_s: float, taken: Collection[str], told: _Found
+) -> Objects | None:
+    """What each row [N] of an agent, seen by several sources, is called (None: nothing is known); None where it stays."""
+    rows = parts[0] if len(parts) == 1 else np.sort(np.concatenate(parts))
+    odd = sum(odd_share(track[part], tolerance_s, _MAX_ODD) * len(part) for part in parts)
     if odd > _MAX_ODD * len(rows):
         told.odd[name] = len(rows)
         return np.full(len(rows), None, dtype=object)
     piece, jump = pieces_of(track[rows], tolerance_s)
-    if jump is not None:
-        told.jumps[name] = jump
-        told.num_agents += int(piece.max()) + 1
-    mark = "." if f"{name}.2" not in names else ".reused."
+    if jump is None:
+        return None
+    told.jumps[name] = jump
+    told.num_agents += int(piece.max()) + 1
+    mark = "." if f"{name}.2" not in taken else ".reused."
     return np.array([name if number == 0 else f"{name}{mark}{number + 1}" for number in piece.tolist()], dtype=object)
 
 

@@ -17,8 +17,7 @@ def is_spike(positions: Positions, max_speed_mps: float) -> Bools:
     first and the last row of an agent, and rows of unknown origin, are never one.
     """
     found = np.zeros(len(positions), dtype=np.bool_)
-    for agent in {agent for agent in positions.agent if agent is not None}:
-        rows = np.flatnonzero(positions.agent == agent)
+    for rows in positions.agents.rows():
         if len(rows) < 3:
             continue
         place = positions.first[rows] + 1j * positions.second[rows]

@@ -5,7 +5,7 @@ they hold: the same places at the same moments.
 """
 
 import itertools
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Final
 
 import numpy as np
@@ -41,10 +41,10 @@ def without_other_stages(rows: Positions, schemas: Mapping[str, str], suspicions
     if not suspicions.looks_for("stage") or len(schemas) < 2:
         return rows
     is_kept = np.ones(len(rows), np.bool_)
-    for stages in _pipelines({topic: rows[rows.topic == topic] for topic in schemas}):
+    for stages in _pipelines(rows, schemas):
         best = _best(stages, schemas)
         others = [topic for topic in stages if topic != best]
-        is_other = np.isin(rows.topic.astype(np.str_), others)
+        is_other = np.array([topic in others for topic in rows.topics.names])[rows.topics.number]
         is_kept &= ~is_other
         reason = "which says who was seen" if _is_named(stages[best]) else "of which least was made"
         suspicions.add(
@@ -63,13 +63,17 @@ def _best(stages: Mapping[str, Positions], schemas: Mapping[str, str]) -> str:
     return min(stages, key=lambda topic: (not names[topic], _work(topic, schemas[topic]), -len(stages[topic]), topic))
 
 
-def _pipelines(found: Mapping[str, Positions]) -> list[dict[str, Positions]]:
+def _pipelines(rows: Positions, topics: Collection[str]) -> list[dict[str, Positions]]:
     """The channels by topic that hold the same objects, together."""
-    families = {topic: family_of(topic) for topic, rows in found.items() if len(rows) >= _MIN_ROWS}
-    group = {topic: topic for topic in families}
+    at = {topic: found for topic, found in zip(rows.topics.names, rows.topics.rows(), strict=True) if topic in topics}
+    families = {topic: family_of(topic) for topic, found in at.items() if len(found) >= _MIN_ROWS}
+    group, found = {topic: topic for topic in families}, dict[str, Positions]()
     for one, other in itertools.combinations(families, 2):
         is_kin = families[one] <= families[other] or families[other] <= families[one]
-        if is_kin and group[one] != group[other] and _coincide(found[one], found[other], families[one] == families[other]):
+        if not is_kin or group[one] == group[other]:
+            continue
+        found |= {topic: rows[at[topic]] for topic in (one, other) if topic not in found}
+        if _coincide(found[one], found[other], families[one] == families[other]):
             group = {topic: group[one] if name == group[other] else name for topic, name in group.items()}
     members = [[topic for topic in group if group[topic] == name] for name in dict.fromkeys(group.values())]
     return [{topic: found[topic] for topic in each} for each in members if len(each) > 1]
@@ -105,7 +109,7 @@ def _gate_m(few: Positions, many: Positions) -> float:
 
 
 def _is_named(rows: Positions) -> bool:
-    return all(name is not None for name in rows.agent)
+    return bool((rows.agents.number >= 0).all())
 
 
 def _work(topic: str, schema: str) -> int:

@@ -56,6 +56,8 @@ def without_set_back(
 def _stretches(rows: Positions) -> Int64s:
     """Of each row [N] of a reader the number of steps back of the log time before it, by the count of messages; else zeros."""
     stretch = np.zeros(len(rows), np.int64)
+    if (np.diff(rows.sequence) >= 0).all():  # rows are in the order of the log
+        return stretch
     order = np.argsort(rows.sequence, kind="stable")
     steps, log_s = np.diff(rows.sequence[order]), np.diff(rows.log_time_ns[order]).astype(np.float64) * 1e-9
     is_counted = steps <= 1 + _MAX_LOST * len(rows)
@@ -71,6 +73,9 @@ def without_unjoined(rows: Mapping[str, Positions], primary: str, suspicions: Su
 
     There are several where the clock of the recorder was set by years: nobody knows how much time lay between them.
     """
+    extent_ns = [time_ns for found in rows.values() if len(found) for time_ns in (found.time_ns[0], found.time_ns[-1])]
+    if not extent_ns or max(extent_ns) - min(extent_ns) <= _MIN_GAP_S * 1e9:
+        return dict(rows)
     edges_ns = _edges(np.sort(np.concatenate([found.time_ns for found in rows.values()])))
     if not len(edges_ns) or not suspicions.looks_for("time"):
         return dict(rows)

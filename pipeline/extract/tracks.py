@@ -97,21 +97,27 @@ def _apart_m(reference: Track, other: Track) -> float:
     return distance_m if distance_m > allowed_m else 0.0
 
 
-def odd_share(track: Track, tolerance_s: float) -> float:
-    """Of its steps the share that no target makes: being at two places, or leaving and coming back at once."""
+def odd_share(track: Track, tolerance_s: float, of_interest: float = 0.0) -> float:
+    """Of its steps the share that no target makes: being at two places, or leaving and coming back at once.
+
+    A share that cannot be above `of_interest` is not looked at more closely, and 0.
+    """
     if len(track) < _MIN_ROWS:
         return 0.0
     step_s, step_m = np.diff(track.time_s), np.abs(np.diff(track.place))
+    back_m, leg_m = np.abs(track.place[2:] - track.place[:-2]), np.minimum(step_m[:-1], step_m[1:])
+    is_return, is_double = leg_m > _MAX_RATIO * back_m, (step_s <= tolerance_s) & (step_m > 0)
+    if is_return.sum() + is_double.sum() <= of_interest * len(step_s):
+        return 0.0
     sigma_m = np.sqrt(track.variance_m2[1:] + track.variance_m2[:-1])
-    back_m, back_s = np.abs(track.place[2:] - track.place[:-2]), track.time_s[2:] - track.time_s[:-2]
-    there, again = step_m[:-1], step_m[1:]
-    is_return = np.minimum(there, again) > np.maximum(_MAX_RATIO * back_m, _SIGMAS * np.maximum(sigma_m[:-1], sigma_m[1:]))
+    is_return &= leg_m > _SIGMAS * np.maximum(sigma_m[:-1], sigma_m[1:])
+    back_s = track.time_s[2:] - track.time_s[:-2]
     speed_mps = np.divide(back_m, back_s, out=np.zeros(len(back_s)), where=back_s > 0)
-    for leg_m, leg_s in ((there, step_s[:-1]), (again, step_s[1:])):
-        is_return &= (leg_s > tolerance_s) & (4 * (leg_m - speed_mps * leg_s) > _MAX_ACCELERATION_MPS2 * leg_s**2)
+    for way_m, way_s in ((step_m[:-1], step_s[:-1]), (step_m[1:], step_s[1:])):
+        is_return &= (way_s > tolerance_s) & (4 * (way_m - speed_mps * way_s) > _MAX_ACCELERATION_MPS2 * way_s**2)
     moments = track[np.diff(track.time_s, prepend=-np.inf) > tolerance_s]
     allowed_m = max(_STEPS * moments.step_m(), _SCATTERS * moments.scatter_m())
-    is_double = (step_s <= tolerance_s) & (step_m > np.maximum(_SIGMAS * sigma_m, allowed_m))
+    is_double &= step_m > np.maximum(_SIGMAS * sigma_m, allowed_m)
     return float(is_return.sum() + is_double.sum()) / len(step_s)
 
 
@@ -121,7 +127,10 @@ def pieces_of(track: Track, tolerance_s: float) -> tuple[Int64s, Jump | None]:
     After a jump comes what was there before another one, if it can, else a new target.
     """
     is_moment = np.diff(track.time_s, prepend=-np.inf) > tolerance_s
-    motion = _Motion(track[is_moment])
+    moments = track[is_moment]
+    if not _is_far(np.abs(np.diff(moments.place)), np.diff(moments.time_s)).any():
+        return np.zeros(len(track), np.int64), None
+    motion = _Motion(moments)
     jumps = motion.jumps()
     if not jumps.any():
         return np.zeros(len(track), np.int64), None
@@ -174,4 +183,8 @@ class _Motion:
         # To leave the speed around, and to come back to it at the other end.
         acceleration_mps2 = 4 * (step_m - around_mps * step_s - noise_m) / step_s**2
         is_fast = (acceleration_mps2 > _MAX_ACCELERATION_MPS2) & (step_m > _MAX_RATIO * around_mps * step_s)
-        return np.asarray(is_fast & ((step_m > _MIN_JUMP_M) | (step_m > _MIN_JUMP_MPS * step_s)))
+        return is_fast & _is_far(step_m, step_s)
+
+
+def _is_far(step_m: Float64s, step_s: Float64s) -> Bools:
+    return np.asarray((step_m > _MIN_JUMP_M) | (step_m > _MIN_JUMP_MPS * step_s))
