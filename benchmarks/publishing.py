@@ -33,7 +33,7 @@ PAGES = {
     "sampling": ("sampler_speed", "scene_samplers", "scene_guidance", "inpainting_jumps", "inpainting_closed_form"),
     "several_targets": ("rendezvous", "attention_cost"),
     "association": ("association",),
-    "logs": ("log_reading", "log_writing"),
+    "logs": ("log_reading", "plausibility", "log_writing"),
     "runs": ("batch", "batch_engines", "memory", "many_agents"),
     "rivals": (),
 }

@@ -104,9 +104,9 @@ def _of_degrees(rows: Positions) -> _Finding | None:
         seen += "" if speed_mps is None else f", which would move at {speed_mps:.3g} m/s"
         return _Finding(f"{seen}, may be metres", "left out", lambda rows: rows[:0], 'x and y, or unit = "deg"')
     is_anywhere = np.median(np.hypot(latitude, longitude)) > _NULL_ISLAND_DEG
-    radian_mps = _speed_mps(_UNITS["rad"](rows), _DEGREE_M) or 0.0
-    if latitude.max() <= np.pi / 2 and longitude.max() <= np.pi and is_anywhere and radian_mps <= _MAX_RADIAN_SPEED_MPS:
-        if not (_has_decimals(latitude) and _has_decimals(longitude)):
+    if latitude.max() <= np.pi / 2 and longitude.max() <= np.pi and is_anywhere:
+        radian_mps = _speed_mps(_UNITS["rad"](rows), _DEGREE_M) or 0.0
+        if radian_mps <= _MAX_RADIAN_SPEED_MPS and not (_has_decimals(latitude) and _has_decimals(longitude)):
             seen += ": off Africa, where no land is, or anywhere if these are radians"
             seen += "" if speed_mps is None else f" ({speed_mps:.3g} m/s in degrees, {radian_mps:.3g} m/s in radians)"
             return _Finding(seen, "read as radians", _UNITS["rad"], 'unit = "rad" or "deg"')
