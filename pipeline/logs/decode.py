@@ -15,30 +15,21 @@ from typing import Any, Final, Literal
 from mcap.records import Schema
 from mcap_protobuf.decoder import DecoderFactory as ProtobufDecoderFactory
 from mcap_ros2.decoder import DecoderFactory as Ros2DecoderFactory
-from rosbags.interfaces import Nodetype
-from rosbags.interfaces.typing import Typesdict
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
 from cadence.errors import InputError
 from pipeline.logs.compression import ZSTD_MAGIC, unpack_message
 from pipeline.logs.flatbuffer import flatbuffer_decoder
-from pipeline.logs.idl import types_from_idl
 from pipeline.logs.reader import Channel
+from pipeline.logs.ros_types import TypeTooLarge, ros1_types, ros2_types
 
 Decoder = Callable[[bytes], Any]
 
-_IDENTIFIER: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")
 _PLAIN_CDR: Final = (b"\x00\x00", b"\x00\x01")
-_CDR_OCTETS: Final = {"byte": "uint8", "char": "uint8", "wchar": "uint16"}
-"""Types of ROS 2 that are unsigned integers on the wire. (In ROS 1 a byte is signed, and a char is not.)"""
 _CHAR_FIELD: Final = re.compile(r"^([ \t]*)char\b", re.MULTILINE)
 _MAX_REASON = 160
 _MAX_STORES: Final = 64
-_STAMPS: Final = {
-    "builtin_interfaces/msg/Time": "int32 sec\nuint32 nanosec\n",
-    "builtin_interfaces/msg/Duration": "int32 sec\nuint32 nanosec\n",
-}
 
 
 _STANDARD: Final[Mapping[str, tuple[Stores, Literal[1, 2], str]]] = {
@@ -157,6 +148,8 @@ def _cdr_decoder(channel: Channel) -> Decoder:
     """By rosbags, twice as fast as mcap_ros2; that one reads some definitions in ros2msg which rosbags refuses."""
     try:
         return _rosbags_cdr_decoder(channel)
+    except TypeTooLarge:
+        raise
     except Exception:  # the other one says what is wrong where it cannot either
         if channel.schema_encoding != "ros2msg":
             raise
@@ -183,31 +176,16 @@ def cdr_types(channel: Channel) -> tuple[Typestore, str]:
     """
     channel = with_definition(channel)
     with _named(channel, UndecodableChannel, "cannot be decoded"):
-        return _cdr_types(channel.schema_name, channel.schema_encoding, channel.schema_data)
+        return ros2_types(channel.schema_name, channel.schema_encoding, channel.schema_data)
 
 
 def _rosbags_cdr_decoder(channel: Channel) -> Decoder:
-    store, name = _cdr_types(channel.schema_name, channel.schema_encoding, channel.schema_data)
+    store, name = ros2_types(channel.schema_name, channel.schema_encoding, channel.schema_data)
     return lambda data: store.deserialize_cdr(data, name)
 
 
-@functools.lru_cache(maxsize=_MAX_STORES)
-def _cdr_types(schema_name: str, schema_encoding: str, schema_data: bytes) -> tuple[Typestore, str]:
-    """A schema takes longer to read than a thousand messages, and is asked for more than once."""
-    text = schema_data.decode("utf-8")
-    if schema_encoding == "ros2idl":
-        types = types_from_idl(text)
-    elif schema_encoding == "ros2msg":
-        types = get_types_from_msg(text, schema_name)
-    else:
-        raise ValueError(f"schema encoding {schema_encoding!r} is not known for CDR")
-    store = _store(_with_octets(types), Stores.EMPTY)
-    return store, _type_name(store, schema_name)
-
-
 def _ros1_decoder(channel: Channel) -> Decoder:
-    store = _store(get_types_from_msg(channel.schema_data.decode("utf-8"), channel.schema_name), Stores.EMPTY)
-    name = _type_name(store, channel.schema_name)
+    store, name = ros1_types(channel.schema_name, channel.schema_data)
     return lambda data: store.deserialize_ros1(data, name)
 
 
@@ -217,46 +195,3 @@ def _mcap_ros2_decoder(channel: Channel) -> Decoder:
     if decode is None:
         raise ValueError("no decoder for it")
     return decode
-
-
-def _with_octets(types: Typesdict) -> Typesdict:
-    """The types with integers for what is an octet or a wide character; rosbags takes a byte for signed."""
-
-    def plain(described: Any) -> Any:
-        kind, detail = described
-        if kind == Nodetype.BASE:
-            return kind, (_CDR_OCTETS.get(detail[0], detail[0]), detail[1])
-        return described if kind == Nodetype.NAME else (kind, (plain(detail[0]), detail[1]))
-
-    return {
-        name: (constants, [(member, plain(described)) for member, described in members])
-        for name, (constants, members) in types.items()
-    }
-
-
-def _store(types: Typesdict, base: Stores) -> Typestore:
-    """A type store of these types alone: definitions of the same name may differ from channel to channel."""
-    for name, (constants, fields) in types.items():
-        for word in (name, *(item[0] for item in constants), *(item[0] for item in fields)):
-            # Registering types runs generated code: nothing but identifiers from a log may get into it.
-            if not _IDENTIFIER.fullmatch(word):
-                raise ValueError(f"{word!r} is not a name")
-    store = get_typestore(base)
-    store.register(types)
-    for name, text in _STAMPS.items():
-        if name not in store.fielddefs:
-            store.register(get_types_from_msg(text, name))
-    return store
-
-
-def _type_name(store: Typestore, schema_name: str) -> str:
-    """The name of the type in the store: "pkg/msg/Type" for "pkg/msg/Type", "pkg/Type" and "pkg::msg::Type"."""
-    parts = schema_name.replace("::", "/").split("/")
-    for name in ("/".join(parts), f"{parts[0]}/msg/{parts[-1]}"):
-        if name in store.fielddefs:
-            try:
-                store.get_msgdef(name)  # now, so that a type that cannot be compiled makes the channel undecodable
-            except KeyError as error:
-                raise ValueError(f"the schema does not define {error.args[0]}") from error
-            return name
-    raise ValueError(f"the schema does not define {schema_name}")
