@@ -15,15 +15,17 @@ from pipeline.logs.summary import Summary
 class Block:
     """A stretch of the file which holds messages: the body of a chunk record, or records outside chunks.
 
-    offset, length  bytes in the file; for loose records they begin with a record head, for chunks with the chunk's fields
-    kind            a "cut" chunk is the last thing in a file that ends inside it
+    offset, length  bytes in the file; for loose and torn records they begin with a record head, for chunks with their fields
+    kind            a "cut" chunk is the last thing in a file that ends inside it, "torn" are the records of a chunk without
+                    compression and checksum that is damaged
     num_messages    by channel id
-    index_length    bytes of the message indexes behind a chunk, where they are known to agree with it; else 0
+    index_length    bytes of the message indexes behind a chunk, where they are known to agree with it, as far as it is torn
+                    with what is left of it; else 0
     """
 
     offset: int
     length: int
-    kind: Literal["chunk", "cut", "loose"]
+    kind: Literal["chunk", "cut", "torn", "loose"]
     start_ns: int
     end_ns: int
     num_messages: Mapping[int, int]

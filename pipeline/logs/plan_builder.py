@@ -1,6 +1,7 @@
 """The plan of a log in the making: what a walk meets is taken record by record, each as a whole or not at all."""
 
-from dataclasses import dataclass, field
+import contextlib
+from dataclasses import dataclass, field, replace
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -20,7 +21,7 @@ from pipeline.logs.records import (
     unpack_chunk,
     unpack_cut_chunk,
 )
-from pipeline.logs.rows import Definitions, Rows, agrees, rows_at, rows_by_index, rows_by_walk
+from pipeline.logs.rows import Definitions, Rows, agrees, rows_at, rows_by_index, rows_by_walk, rows_in_torn
 from pipeline.logs.summary import Summary
 
 LOOSE_BLOCK_BYTES: Final = 2**20
@@ -85,14 +86,31 @@ class PlanBuilder:
         self.plan.has_checksums = self.plan.has_checksums and chunk.crc != 0
         facts = ChunkFacts(HEAD.size + length, chunk.start_ns, chunk.end_ns, chunk.crc)
         self.tally.chunks[offset - HEAD.size] = facts
+        span = (chunk.start_ns, chunk.end_ns) if is_span(chunk.start_ns, chunk.end_ns) else None
         try:
             block = self._block(offset, length, unpack_chunk(chunk), has_checksum=chunk.crc != 0)
         except DamagedRecord as error:
-            span = (chunk.start_ns, chunk.end_ns) if is_span(chunk.start_ns, chunk.end_ns) else None
-            self.add_loss(offset - HEAD.size, str(error), span, is_chunk=True)
+            if chunk.crc or chunk.compression:
+                self.add_loss(offset - HEAD.size, str(error), span, is_chunk=True)
+            else:
+                begin = offset + length - len(chunk.data)
+                self.add_torn_chunk(begin, bytes(chunk.data), Loss(offset - HEAD.size, str(error), span))
         else:
             if block.num_messages:
                 self.plan.blocks.append(block)
+
+    def add_torn_chunk(self, offset: int, data: bytes, loss: Loss) -> None:
+        """Take what is left of a chunk that is neither compressed nor covered by a checksum; `data` are its records."""
+        entries, index_length = self._walk.index_behind(offset + len(data))
+        found, definitions = rows_in_torn(data, entries)
+        rows = self._usable(found, [])
+        for opcode, body in definitions:
+            with contextlib.suppress(DamagedRecord):
+                self.add_definition(opcode, body)
+        if len(rows):
+            self.plan.blocks.append(Block(offset, len(data), "torn", *rows.span_ns(), rows.counts(), index_length))
+        num_lost = sum(len(named) for _, named in entries) - len(found) if entries else None
+        self.plan.losses.append(replace(loss, reason=f"{loss.reason}; {len(rows)} were saved", num_messages=num_lost))
 
     def add_cut_chunk(self, offset: int, body: bytes) -> None:
         """Take the beginning of the chunk in which the file ends."""

@@ -109,21 +109,35 @@ def leading_rows(data: bytes) -> tuple[Rows, int]:
 
 def rows_by_index(data: bytes, index: Index) -> tuple[Rows, Definitions] | None:
     """The same as `rows_by_walk`, by the message indexes of the chunk; None where they do not agree with its content."""
-    offsets = np.concatenate([np.empty(0, np.uint64), *(entries["offset"] for _, entries in index)])
-    if not len(offsets) or (offsets > np.uint64(max(0, len(data) - _MESSAGE.itemsize))).any() or len(data) < _MESSAGE.itemsize:
-        return None
-    order = np.argsort(offsets, kind="stable")
-    begin = offsets[order].astype(np.int64)
+    begin, ids, times, num_outside = _named(data, index)
     heads = _heads(data, begin)
-    times = np.concatenate([entries["log_time"] for _, entries in index])[order]
-    ids = np.repeat([number for number, _ in index], [len(entries) for _, entries in index])[order]
-    length = heads["length"]
-    is_message = (heads["opcode"] == Opcode.MESSAGE) & (length >= MESSAGE_HEAD.size) & (length <= len(data))
-    if not (is_message & (heads["log_time"] == times) & (heads["channel_id"] == ids)).all():
+    if not len(begin) or num_outside or not _are_there(heads, ids, times, len(data)).all():
         return None
-    end = begin + HEAD.size + length.astype(np.int64)
+    end = begin + HEAD.size + heads["length"].astype(np.int64)
     definitions = _between(data, np.append(0, end), np.append(begin, len(data)))
     return None if definitions is None else (_rows_of(heads, begin, end), definitions)
+
+
+def rows_in_torn(data: bytes, index: Index) -> tuple[Rows, Definitions]:
+    """The messages of a chunk that is broken and that no checksum covers: those which its index names and which are there.
+
+    In front of a damaged place one message more is left out, because its end may be damaged as well. Without an index those
+    in front of the first damaged place are found. Definitions are those beside such messages.
+    """
+    if not index:
+        offsets, definitions = _walked(data, is_cut=True)
+        return rows_at(data, np.array(offsets[:-1], dtype=np.int64)), definitions
+    begin, ids, times, _ = _named(data, index)
+    heads = _heads(data, begin)
+    end = begin + HEAD.size + np.minimum(heads["length"], len(data)).astype(np.int64)
+    following = np.append(begin, len(data))[1:]
+    is_there = _are_there(heads, ids, times, len(data)) & (end <= following)
+    gaps = [_between(data, begin=end[i : i + 1], end=following[i : i + 1]) for i in range(len(begin))]
+    is_followed = np.append(is_there, True)[1:] & np.array([gap is not None for gap in gaps], np.bool_)
+    is_sound = is_there & is_followed
+    in_front = _between(data, np.zeros(1, np.int64), np.append(begin, len(data))[:1]) if is_sound[:1].all() else None
+    definitions = [item for gap, is_beside in zip(gaps, is_sound, strict=True) if is_beside for item in gap or ()]
+    return _rows_of(heads[is_sound], begin[is_sound], end[is_sound]), [*(in_front or ()), *definitions]
 
 
 def indexed_rows(data: bytes, index: bytes, channel_ids: Set[int]) -> Rows:
@@ -148,6 +162,26 @@ def agrees(rows: Rows, channel_id: int, entries: npt.NDArray[np.void]) -> bool:
     found = np.empty(len(own), INDEX_ENTRY)
     found["log_time"], found["offset"] = own.log_time_ns, own.begin - _MESSAGE.itemsize
     return np.array_equal(np.sort(found), np.sort(entries))
+
+
+def _named(data: bytes, index: Index) -> tuple[Int64s, npt.NDArray[np.int64], npt.NDArray[np.uint64], int]:
+    """Where the messages that an index names should begin, in order, their channels and times; and how many lie outside."""
+    offsets = np.concatenate([np.empty(0, np.uint64), *(entries["offset"] for _, entries in index)])
+    times = np.concatenate([np.empty(0, np.uint64), *(entries["log_time"] for _, entries in index)])
+    ids = np.repeat([number for number, _ in index], [len(entries) for _, entries in index]).astype(np.int64)
+    last = len(data) - _MESSAGE.itemsize
+    inside = np.flatnonzero(offsets <= np.uint64(max(0, last))) if last >= 0 else np.empty(0, np.int64)
+    order = inside[np.argsort(offsets[inside], kind="stable")]
+    return offsets[order].astype(np.int64), ids[order], times[order], len(offsets) - len(order)
+
+
+def _are_there(
+    heads: npt.NDArray[np.void], ids: npt.NDArray[np.int64], times: npt.NDArray[np.uint64], size: int
+) -> npt.NDArray[np.bool_]:
+    """Which of the heads are those of the messages of these channels and times in `size` bytes."""
+    is_message = (heads["opcode"] == Opcode.MESSAGE) & (heads["length"] >= MESSAGE_HEAD.size) & (heads["length"] <= size)
+    are_there: npt.NDArray[np.bool_] = is_message & (heads["log_time"] == times) & (heads["channel_id"] == ids)
+    return are_there
 
 
 def _walked(data: bytes, is_cut: bool) -> tuple[list[int], Definitions]:

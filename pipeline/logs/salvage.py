@@ -5,12 +5,14 @@ what is left. Chunks are decompressed one at a time and their CRCs checked; only
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import BinaryIO, Final
 
 from mcap.opcode import Opcode
 
 from pipeline.logs.checksum import DataChecksum
 from pipeline.logs.file_walk import MAX_SMALL_BYTES, FileWalk, RecordHead
+from pipeline.logs.plan import Loss
 from pipeline.logs.plan_builder import LOOSE_BLOCK_BYTES, PlanBuilder
 from pipeline.logs.records import (
     CHUNK_HEAD_BYTES,
@@ -271,5 +273,20 @@ class Scan:
             return
         where = f"bytes {offset} to {walk.position}" if not walk.is_over() else f"everything from byte {offset} on"
         where += " (too much of it looks like records)" if walk.search.is_given_up else ""
-        self.builder.add_loss(offset, f"{reason}; {where} skipped", span)
+        loss = Loss(offset, f"{reason}; {where} skipped", span)
+        if not self._save_torn(loss):
+            self.builder.add_loss(loss.offset, loss.reason, loss.span_ns)
         self.previous = Opcode.CHUNK  # whatever lay there may have been a chunk with its indexes
+
+    def _save_torn(self, loss: Loss) -> bool:
+        """Save what is left of a chunk whose head is damaged, where its index says that it is not compressed."""
+        index = self.plan.summary.chunks.get(loss.offset) if self.plan.summary is not None else None
+        if index is None or index.compression or self.plan.has_checksums:
+            return False
+        if index.uncompressed_size > min(index.chunk_length, MAX_CHUNK_BYTES):
+            return False
+        span = index.message_start_time, index.message_end_time
+        begin = loss.offset + index.chunk_length - index.uncompressed_size
+        data = self.walk.read(begin, index.uncompressed_size)
+        self.builder.add_torn_chunk(begin, data, replace(loss, span_ns=span))
+        return True

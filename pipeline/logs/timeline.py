@@ -23,10 +23,12 @@ from pipeline.logs.records import (
     MAX_TIME_NS,
     DamagedRecord,
     parse_chunk,
+    parse_message_index,
     unpack_chunk,
     unpack_cut_chunk,
+    walk,
 )
-from pipeline.logs.rows import Rows, indexed_rows, rows_by_walk
+from pipeline.logs.rows import Rows, indexed_rows, rows_by_walk, rows_in_torn
 
 MAX_HELD_BYTES: Final = 2**27
 """So many bytes of unpacked blocks, and of messages that wait for each other, are held where blocks overlap."""
@@ -140,7 +142,11 @@ class Timeline:
         wanted = self.selection.channels[number]
         data = _unpacked(file, block)
         index = b"" if block.index_length == 0 else read_span(file, block.offset + block.length, block.index_length)
-        rows = indexed_rows(data, index, wanted.keys()) if index else _walked(data, block, wanted)
+        if block.kind == "torn" or not index:
+            rows = _walked(data, block, index)
+            rows = rows[np.isin(rows.channel_id, list(wanted))]
+        else:
+            rows = indexed_rows(data, index, wanted.keys())
         is_in_time = (rows.log_time_ns >= self.selection.start_ns) & (rows.log_time_ns < np.uint64(self.selection.end_ns))
         return data, (rows if is_in_time.all() else rows[is_in_time]).by_time()
 
@@ -222,7 +228,8 @@ def _unpacked(file: BinaryIO, block: Block) -> bytes:
     return unpack_cut_chunk(data)[1] if block.kind == "cut" else data
 
 
-def _walked(data: bytes, block: Block, wanted: Mapping[int, Channel]) -> Rows:
-    """The messages of the wanted channels by a walk over the records."""
-    rows = rows_by_walk(data, block.kind == "cut")[0]
-    return rows[np.isin(rows.channel_id, list(wanted))]
+def _walked(data: bytes, block: Block, index: bytes) -> Rows:
+    """The messages of a block by a walk over its records, of a torn one those that are left."""
+    if block.kind == "torn":
+        return rows_in_torn(data, [parse_message_index(index[begin:end]) for _, begin, end in walk(index)])[0]
+    return rows_by_walk(data, block.kind == "cut")[0]
