@@ -8,7 +8,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from cadence.errors import InputError
+from cadence.errors import InputError, NothingDetectedError
 from pipeline.arrays import Int64s
 from pipeline.catalogue import (
     CATALOGUE_VERSION,
@@ -98,6 +98,8 @@ def _survey(paths: Sequence[Path], progress: Progress) -> Catalogue:
     name, size_bytes = mission_name(paths), sum(part.size_bytes for part in parts)
     with progress.bar(size_bytes, f"check {name}", unit="B", scale=True) as bar:
         log = open_parts(paths, bar.update)
+    if log.health.num_messages == 0 and log.health.is_complete:
+        raise NothingDetectedError(f"{paths[0]}: is sound, but no message was recorded in it; there is nothing to infer from")
     if log.health.num_messages == 0:
         why = log.health.problems[0] if log.health.problems else "nothing was recorded"
         raise InputError(f"{paths[0]}: holds no message that can be read ({why}); check the recording")

@@ -98,8 +98,8 @@ def diagnose(parts: Sequence[Path], progress: Progress) -> Diagnosis:
         size = sum(part.stat().st_size for part in parts if part.is_file())
         with progress.bar(size, f"check {parts[0].name}", unit="B", scale=True) as bar:
             log = open_parts(parts, bar.update)
-        if not log.health.num_messages:
-            return _unusable(name, log.health.problems or ("The file holds no message.",))
+        if not log.health.num_messages and not log.health.is_complete:
+            return _unusable(name, log.health.problems)
         return _of(name, log)
     except InputError as error:
         return _unusable(name, (str(error),))
@@ -119,7 +119,9 @@ def render(diagnosis: Diagnosis) -> str:
     """The diagnosis as text."""
     doubt = f"; DOUBTFUL: {len(diagnosis.suspicions)} things in it can hardly be meant" if diagnosis.suspicions else ""
     lines = [f"{diagnosis.log}: {_MEANING[diagnosis.verdict]}{doubt}"]
-    if diagnosis.num_messages:
+    if diagnosis.verdict != "unusable" and not diagnosis.num_messages:
+        lines.append("  no message was recorded")
+    elif diagnosis.num_messages:
         of = "" if diagnosis.num_messages_expected is None else f" of {diagnosis.num_messages_expected}"
         span = f"{utc(diagnosis.start_ns)} to {utc(diagnosis.end_ns)}"
         lines.append(f"  {diagnosis.num_messages}{of} messages can be read, {span}")

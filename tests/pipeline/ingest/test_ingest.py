@@ -6,7 +6,7 @@ from fixtures.line_logs import straight_line, write_log
 from fixtures.recorder import NUM_MESSAGES, START_NS, STEP_NS, recording
 from mcap.writer import Writer
 
-from cadence.errors import InputError
+from cadence.errors import InputError, NothingDetectedError
 from pipeline.catalogue import open_catalogued_log, read_catalogue
 from pipeline.extract.config import ExtractConfig
 from pipeline.extract.stage import extract
@@ -137,6 +137,17 @@ def test_unusable_log_leaves_nothing_behind(data, words, tmp_path):
         ingested(tmp_path / "gone.mcap", out)
     with pytest.raises(InputError, match="folder"):
         ingested(tmp_path, out)
+
+
+def test_a_sound_log_without_a_message_is_no_failure_of_a_batch(tmp_path):
+    path = tmp_path / "none.mcap"
+    path.write_bytes(recording(num_messages=0))
+    with pytest.raises(NothingDetectedError, match="no message was recorded"):
+        ingested(path, tmp_path / "out")
+    path.write_bytes(recording(num_messages=0, has_summary=False)[:-60])
+    with pytest.raises(InputError, match="no message") as error:
+        ingested(path, tmp_path / "out")
+    assert not isinstance(error.value, NothingDetectedError)
 
 
 def test_catalogue_that_is_absent_damaged_or_old_is_refused(log, tmp_path):

@@ -98,7 +98,6 @@ def test_a_lost_footer_is_a_fault_without_loss(examined: Callable[[bytes], Diagn
     [
         (b"", "is empty"),
         (b"#ROSBAG V2.0\n" + bytes(100), "ROS 1 bag"),
-        (recording(num_messages=0), "holds no message"),
         (recording()[:30], "inside a record"),
     ],
 )
@@ -106,6 +105,13 @@ def test_what_holds_no_message_is_unusable(data: bytes, words: str, examined: Ca
     found = examined(data)
     assert found.verdict == "unusable" and words in " ".join(found.problems)
     assert "UNUSABLE" in render(found) and exit_code([found]) == 3
+
+
+def test_a_sound_log_without_a_message_is_not_unusable(examined: Callable[[bytes], Diagnosis]) -> None:
+    found = examined(recording(num_messages=0))
+    assert found.verdict == "sound" and not found.problems and found.num_messages == 0 and found.no_use
+    assert "SOUND" in render(found) and "no message was recorded" in render(found) and exit_code([found]) == 0
+    assert examined(recording(num_messages=0)[:-60]).verdict in ("faulty", "unusable")
 
 
 def test_a_missing_log_does_not_stop_the_others(tmp_path: Path) -> None:
