@@ -43,45 +43,59 @@ class GuidanceConfig:
 
 
 @dataclass(frozen=True, eq=False)
-class Feasibility:
-    """What hypotheses must obey, for R rows whose datum is `offset_m` [R, 1, 1, 2] in the obstacles' frame.
-
-    obstacles      may be empty
-    margin_m       kept from them
-    max_speed_mps  that is stated, None for no limit
-    plausible_speed_mps  what the log's own detections let one believe; tracks keep it, but are not guided by it
-    step_s         of the grid
-    num_steps      of guidance on each clean estimate
-    """
+class Place:
+    """What is in the way: obstacles, the margin to keep from them, and the datum of the rows in their frame [R, 1, 1, 2]."""
 
     obstacles: Obstacles
     margin_m: float
-    max_speed_mps: float | None
-    step_s: float
     offset_m: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class Feasibility:
+    """What hypotheses must obey.
+
+    place          what is in the way; its obstacles may be none
+    step_s         of the grid
+    max_speed_mps  that is stated, None for no limit
+    plausible_speed_mps  what the log's own detections let one believe; tracks keep it, but are not guided by it
+    num_steps      of guidance on each clean estimate
+    """
+
+    place: Place
+    step_s: float
+    max_speed_mps: float | None = None
     plausible_speed_mps: float | None = None
     num_steps: int = 3
 
     @classmethod
     def of(cls, windows: WindowBatch, config: GuidanceConfig, plausible_speed_mps: float | None = None) -> Self:
         """What the active agents of windows, one a row, must obey; without a context there are no obstacles."""
-        window = windows.is_active.nonzero()[:, 0]
         context = windows.context
         datum_m = torch.zeros(windows.num_windows, 2, dtype=torch.float64) if context is None else context.datum_m
+        offset_m = datum_m[windows.is_active.nonzero()[:, 0], None, None]
+        if config.mode == "none":
+            return cls(Place(Obstacles.none(), 0.0, offset_m), windows.step_s)
         obstacles = Obstacles.none() if context is None else context.obstacles
-        offset_m = datum_m[window, None, None]
-        return cls(obstacles, config.margin_m, config.max_speed_mps, windows.step_s, offset_m, plausible_speed_mps)
+        place = Place(obstacles, config.margin_m, offset_m)
+        return cls(place, windows.step_s, config.max_speed_mps, plausible_speed_mps)
 
     @property
-    def is_limited(self) -> bool:
-        """Whether there is anything to obey."""
-        return self.obstacles.count > 0 or self.max_speed_mps is not None
+    def is_stated(self) -> bool:
+        """Whether there is anything to be guided by."""
+        return self.place.obstacles.count > 0 or self.max_speed_mps is not None
+
+    @property
+    def longest_m(self) -> float | None:
+        """How long a step may be."""
+        limits = [speed for speed in (self.max_speed_mps, self.plausible_speed_mps) if speed is not None]
+        return min(limits) * self.step_s if limits else None
 
     def guide(self, position_m: Tensor, sigma_m: Tensor, rows: slice) -> Tensor:
         """Clean estimates [R', K, T, 2] moved towards the feasible, as far as the bank is uncertain there."""
         constraints: list[Constraint] = []
-        if self.obstacles.count:
-            constraints.append(ObstacleConstraint(self.obstacles, self.margin_m, self.offset_m[rows]))
+        if self.place.obstacles.count:
+            constraints.append(ObstacleConstraint(self.place.obstacles, self.place.margin_m, self.place.offset_m[rows]))
         if self.max_speed_mps is not None:
             constraints.append(SpeedConstraint(self.max_speed_mps, self.step_s))
         return clean_estimate_guidance(position_m, constraints, sigma_m[:, None, :, None], self.num_steps)
@@ -96,7 +110,7 @@ class Feasibility:
             less — and which of them are to be kept [R, K]: those within all limits, or where there are none in a row, those
             that are only faster than is plausible; none at all where every one breaks what was stated.
         """
-        if not self.obstacles.count and self.longest_m is None:
+        if not self.place.obstacles.count and self.longest_m is None:
             even = torch.full(position_m.shape[:2], 1.0 / position_m.shape[1], dtype=torch.float64)
             return position_m, even, torch.ones_like(even, dtype=torch.bool)
         moved, is_feasible = self._within_limits(position_m, sigma_m, length_m)
@@ -110,30 +124,14 @@ class Feasibility:
         )
         return moved, weight / weight.sum(1, keepdim=True), is_feasible
 
-    @property
-    def longest_m(self) -> float | None:
-        """How long a step may be."""
-        limits = [speed for speed in (self.max_speed_mps, self.plausible_speed_mps) if speed is not None]
-        return min(limits) * self.step_s if limits else None
-
     def _within_limits(self, position_m: Tensor, sigma_m: Tensor, length_m: float) -> tuple[Tensor, Tensor]:
         is_pinned = (sigma_m <= _PINNED_SHARE * length_m)[:, None].expand(position_m.shape[:3])
         is_held = (sigma_m <= _HELD_SHARE * length_m) | (sigma_m == sigma_m.amin(dim=1, keepdim=True))
         held = is_held[:, None].expand(position_m.shape[:3])
-        place = Place(self.obstacles, self.margin_m, self.offset_m)
-        moved, is_feasible = within_limits(position_m, place, is_pinned, self.longest_m, held)
+        moved, is_feasible = within_limits(position_m, self.place, is_pinned, self.longest_m, held)
         if self.max_speed_mps is not None:
             is_feasible = is_feasible & ~exceeds(moved, self.max_speed_mps * self.step_s)
         return moved, is_feasible
-
-
-@dataclass(frozen=True, eq=False)
-class Place:
-    """What is in the way: obstacles, the margin to keep from them, and the datum of the rows in their frame [R, 1, 1, 2]."""
-
-    obstacles: Obstacles
-    margin_m: float
-    offset_m: Tensor
 
 
 def within_limits(
@@ -161,6 +159,28 @@ def within_limits(
         if longest_m is None or not bool((exceeds(moved, longest_m) | ~is_clear).any()):
             break
     return moved, is_clear
+
+
+def redrawn(position_m: Tensor, weight: Tensor, is_kept: Tensor, seeds: Tensor, are_all: bool = False) -> tuple[Tensor, Tensor]:
+    """Hypotheses [R, K, T, 2], those that are not kept drawn again from those of their row that are; rows without any stay.
+
+    Args:
+        position_m: the hypotheses.
+        weight: [R, K] their chances to be drawn.
+        is_kept: [R, K] which may be.
+        seeds: [R] of the draws.
+        are_all: draw all rows anew by weight, not only those that need it.
+
+    Returns:
+        The hypotheses, and which rows were drawn anew and count evenly since [R].
+    """
+    is_hopeless = ~is_kept.any(1)
+    chance = torch.where(is_kept | is_hopeless[:, None], weight, 0.0)
+    is_redrawn = torch.ones_like(is_hopeless) if are_all else ~is_kept.all(1) & ~is_hopeless
+    out = position_m.clone()
+    chance = chance[is_redrawn] / chance[is_redrawn].sum(1, keepdim=True)
+    out[is_redrawn] = resampled(position_m[is_redrawn], chance, seeds[is_redrawn])
+    return out, is_redrawn
 
 
 def resampled(position_m: Tensor, weight: Tensor, seeds: Tensor) -> Tensor:

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from cadence.bank.bank import Bank, BankPosterior
 from cadence.bank.rows import active_rows, scatter_hypotheses, with_status
-from cadence.diffusion.feasible import Feasibility, GuidanceConfig, resampled
+from cadence.diffusion.feasible import Feasibility, GuidanceConfig, redrawn
 from cadence.diffusion.sampler import even_angles, sample_ddim, sample_dpmpp_2m, sample_rotation
 from cadence.diffusion.transport import bend_of, smoothed_displacement
 from cadence.network.residual import ResidualNetwork
@@ -83,35 +83,24 @@ class GeneralModel:
     def sample(self, windows: WindowBatch, num_hypotheses: int) -> HypothesisSet:
         """Draw hypotheses for every active agent; deterministic in the windows' seeds.
 
-        The status of an agent is "guidance_diverged" where samples of the bank had to stand in, "infeasible" where a
-        hypothesis could not be led out of an obstacle.
+        The status of an agent is "guidance_diverged" where samples of the bank had to stand in, "infeasible" where no
+        hypothesis could be brought within the limits: they are as they were.
         """
         limits = Feasibility.of(windows, self.guidance, self.plausible_speed_mps)
         posterior = self.bank.posterior(windows, num_hypotheses)
-        sample_m = self.denoised(posterior, windows, limits.guide if self._guides(limits) else None)
+        is_guided = self.guidance.mode == "clean" and limits.is_stated
+        sample_m = self.denoised(posterior, windows, limits.guide if is_guided else None)
         is_finite = torch.isfinite(sample_m).flatten(1).all(1)
         sample_m = torch.where(is_finite[:, None, None, None], sample_m, posterior.sample_m)
-        drawn = scatter_hypotheses(sample_m, windows)
-        is_free = self.guidance.mode == "none" or not (limits.obstacles.count or limits.longest_m)
-        if is_free or not len(sample_m):
-            return with_status(drawn, windows, ~is_finite, torch.zeros_like(is_finite))
-        kept_m, row_weight, is_feasible = limits.finish(sample_m, posterior.sigma_m, self.bank.length_m(windows.step_s))
-        # What keeps no limit is drawn again from what does; where nothing does, that is said instead.
-        is_hopeless = ~is_feasible.any(1)
-        chance = torch.where(is_feasible | is_hopeless[:, None], row_weight, 0.0)
-        chance = chance / chance.sum(1, keepdim=True)
-        is_mixed = torch.ones_like(is_hopeless) if windows.num_agents > 1 else ~is_feasible.all(1) & ~is_hopeless
-        seeds = active_rows(windows)[1]
-        kept_m[is_mixed] = resampled(kept_m[is_mixed], chance[is_mixed], seeds[is_mixed])
-        weight = drawn.weight
+        moved_m, row_weight, is_kept = limits.finish(sample_m, posterior.sigma_m, self.bank.length_m(windows.step_s))
+        # Weights belong to one agent's tracks; a joint hypothesis of several has but one.
+        kept_m, is_even = redrawn(moved_m, row_weight, is_kept, active_rows(windows)[1], are_all=windows.num_agents > 1)
+        drawn = scatter_hypotheses(kept_m, windows)
         if windows.num_agents == 1:
-            weight = weight.clone()
-            weight[windows.is_active[:, 0]] = torch.where(is_mixed[:, None], 1.0 / num_hypotheses, row_weight)
-        kept = HypothesisSet(scatter_hypotheses(kept_m, windows).position_m, weight, drawn.status)
-        return with_status(kept, windows, ~is_finite, is_hopeless)
-
-    def _guides(self, limits: Feasibility) -> bool:
-        return self.guidance.mode == "clean" and limits.is_limited
+            weight = drawn.weight.clone()
+            weight[windows.is_active[:, 0]] = torch.where(is_even[:, None], 1.0 / num_hypotheses, row_weight)
+            drawn = HypothesisSet(drawn.position_m, weight, drawn.status)
+        return with_status(drawn, windows, ~is_finite, ~is_kept.any(1))
 
     def denoised(self, posterior: BankPosterior, windows: WindowBatch, guide: CleanHook | None = None) -> Tensor:
         """The bank's samples as the network moves them [R, K, T, 2], clean estimates led by `guide`; no repair."""

@@ -14,7 +14,7 @@ from torch import Tensor
 from cadence.bank.rows import scatter_hypotheses
 from cadence.constraints.obstacles import ObstacleConstraint
 from cadence.constraints.speed import exceeds
-from cadence.diffusion.feasible import Place, resampled, within_limits
+from cadence.diffusion.feasible import Place, redrawn, within_limits
 from cadence.diffusion.guidance import PaperCost, adam_guidance, clean_estimate_guidance
 from cadence.diffusion.noise import RowNoise
 from cadence.diffusion.sampler import even_angles, even_log_snr, sample_ddim, sample_ddpm, sample_dpmpp_2m
@@ -175,11 +175,8 @@ class SceneModel:
         longest_m = self.config.max_step_m
         moved, is_clear = within_limits(positions, place, is_pinned, longest_m, is_first.expand(positions.shape[:-1]))
         is_kept = is_clear & ~exceeds(moved, longest_m)
-        is_mixed = is_kept.any(1) & ~is_kept.all(1)
-        if team is None and bool(is_mixed.any()):
-            chance = is_kept[is_mixed].double()
-            moved = moved.clone()
-            moved[is_mixed] = resampled(moved[is_mixed], chance / chance.sum(1, keepdim=True), windows.seeds[is_mixed])
+        if team is None:
+            moved, _ = redrawn(moved, torch.ones_like(is_kept, dtype=torch.float64), is_kept, windows.seeds)
         return moved
 
     def _solved(self, denoise: Callable[[Tensor, float], Tensor], start: Tensor, stream: RowNoise, tracks: "_Tracks") -> Tensor:
