@@ -1,5 +1,6 @@
 """What estimators are fitted to: the detections of one log, never its truth."""
 
+import functools
 from dataclasses import dataclass
 
 import pyarrow as pa
@@ -32,8 +33,9 @@ class FittingData:
     def fitted_bank(self) -> Bank:
         """The bank fitted to the log: weights by likelihood, the choice among its settings by hindsight on later detections."""
         bank = Bank().fit(self.tracks, self.grid.step_s)
-        return choose_by_hindsight(bank, *self.hindsight_windows())
+        return choose_by_hindsight(bank, *self.hindsight_windows)
 
+    @functools.cached_property
     def hindsight_windows(self) -> tuple[WindowBatch, Detections]:
         """Evenly spread windows in which something was detected before the origin and after it, and what was after it."""
         later = later_detections(self.detections, self.grid, self.windows, self.default_sigma_m)

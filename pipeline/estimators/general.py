@@ -42,7 +42,7 @@ def load_general(weights: Path | None, samplings: Samplings) -> Loaded:
 def fitted_model(model: GeneralModel, data: FittingData, is_gated: bool = True) -> GeneralModel:
     """The model fitted to the log's detections; settings of the bank and the network's part in it chosen by hindsight."""
     fitted = dataclasses.replace(model, bank=data.fitted_bank())
-    return gated(fitted, *data.hindsight_windows()) if is_gated else fitted
+    return gated(fitted, *data.hindsight_windows) if is_gated else fitted
 
 
 def _fitted(model: GeneralModel, samplings: Samplings, data: FittingData) -> Fitted:

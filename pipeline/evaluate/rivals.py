@@ -9,7 +9,7 @@ from pipeline.estimators.fitting import FittingData
 
 
 def _tuned(rival: ConstantVelocityKalman | OrnsteinUhlenbeckKalman, data: FittingData) -> Estimator:
-    return rival.fit(data.tracks, data.grid.step_s).tuned(*data.hindsight_windows())
+    return rival.fit(data.tracks, data.grid.step_s).tuned(*data.hindsight_windows)
 
 
 RIVALS: Mapping[str, Callable[[FittingData], Estimator]] = {
