@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from cadence.errors import ConfigError
+from cadence.errors import ConfigError, DeviceError
 from cadence.types import Estimator
 from pipeline.checkpoints import find_checkpoint, read_info
 from pipeline.config import changed_settings
@@ -29,12 +29,14 @@ class Preset:
     load       weights and settings → what the stages use
     reads      settings of [infer] that it reads, beside those that every preset does (`READ_BY_ALL`); a name with a full stop
                at its end stands for the whole table
+    runs_on    devices that it runs on, beside the choice of its own ("auto")
     infers     it draws hypotheses of a recorded mission
     forecasts  it forecasts by the paper's protocol, without being fitted to a log
     """
 
     load: Callable[[Path, Samplings], Loaded]
     reads: tuple[str, ...] = ()
+    runs_on: tuple[str, ...] = ("cpu",)
     infers: bool = True
     forecasts: bool = True
 
@@ -47,7 +49,7 @@ READ_BY_ALL = (
 _BANK = ("grid.", "guidance.")
 
 PRESETS: Mapping[str, Preset] = {
-    "general": Preset(load_general, ("sampler", "num_steps", "is_gated", *_BANK), forecasts=False),
+    "general": Preset(load_general, ("sampler", "num_steps", "is_gated", *_BANK), ("cpu", "cuda"), forecasts=False),
     "scene": Preset(load_place, ("scene.", "guidance.")),
     "paper": Preset(load_paper, ("paper.",)),
     **dict.fromkeys(RIVALS, Preset(load_mixture, infers=False)),
@@ -64,14 +66,14 @@ def load_estimator(checkpoint: str, samplings: Samplings) -> Loaded:
     weights = find_weights(checkpoint)
     if weights is None:
         return load_general(None, samplings)
-    return _preset(weights, "draw hypotheses of missions", lambda preset: preset.infers).load(weights, samplings)
+    return _load(_preset(weights, "draw hypotheses of missions", lambda preset: preset.infers), weights, samplings)
 
 
 def load_forecaster(checkpoint: str, samplings: Samplings | None = None) -> Estimator:
     """The estimator that the paper's protocol scores. `ConfigError` for checkpoints that cannot be read or do not forecast."""
     weights = find_checkpoint(checkpoint)
     preset = _preset(weights, "forecast", lambda preset: preset.forecasts)
-    return preset.load(weights, samplings or Samplings()).estimator
+    return _load(preset, weights, samplings or Samplings()).estimator
 
 
 def refuse_unread(checkpoint: str, config: object) -> None:
@@ -100,6 +102,14 @@ def _unread(settings: Iterable[str], reads: Iterable[str]) -> list[str]:
         for setting in settings
         if not any(setting == name or (name.endswith(".") and setting.startswith(name)) for name in known)
     ]
+
+
+def _load(preset: Preset, weights: Path, samplings: Samplings) -> Loaded:
+    device = samplings.device
+    if device != "auto" and device.partition(":")[0] not in preset.runs_on:
+        known = ", ".join(preset.runs_on)
+        raise DeviceError(f"infer.device {device!r}: {weights.stem} does not run there; use auto, or one of: {known}")
+    return preset.load(weights, samplings)
 
 
 def _preset(weights: Path, purpose: str, serves: Callable[[Preset], bool]) -> Preset:

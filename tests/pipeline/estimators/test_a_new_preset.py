@@ -10,7 +10,7 @@ from fixtures.unknown_origin import GRID, detections, mission
 from torch import nn
 
 from cadence.bank.rows import scatter_hypotheses
-from cadence.errors import ConfigError
+from cadence.errors import ConfigError, DeviceError
 from cadence.types import Detections, HypothesisSet, WindowBatch
 from pipeline.checkpoints import CheckpointInfo, save_checkpoint
 from pipeline.estimators import presets
@@ -70,6 +70,12 @@ def test_forecasts_are_scored_with_it_and_it_names_the_settings_that_it_reads(we
     refuse_unread(str(weights), InferConfig(checkpoint=str(weights), grid=GridConfig(step_s=3.0)))
     with pytest.raises(ConfigError, match=r"infer\.num_steps: .* \(preset parked\) .* Read are: infer\.grid,"):
         refuse_unread(str(weights), InferConfig(checkpoint=str(weights), num_steps=2))
+
+
+def test_a_device_on_which_the_preset_does_not_run_is_refused(weights: Path) -> None:
+    assert load_estimator(str(weights), Samplings(device="cpu")).preset == "parked"
+    with pytest.raises(DeviceError, match=r"infer\.device 'cuda': parked does not run there; use auto, or one of: cpu"):
+        load_estimator(str(weights), Samplings(device="cuda"))
 
 
 def test_a_preset_serves_the_stages_that_it_says(weights: Path, monkeypatch: pytest.MonkeyPatch) -> None:
