@@ -28,8 +28,6 @@ from pipeline.estimators.fitting import FittingData
 from pipeline.estimators.presets import load_estimator
 from pipeline.estimators.samplings import GeneralSampling, Samplings
 from pipeline.evaluate.rivals import RIVALS
-from pipeline.evaluate.scores import METRICS, PARTS, Cells, compare, groups_of
-from pipeline.evaluate.stage import default_truth_gap_s
 from pipeline.extract.config import ExtractConfig
 from pipeline.extract.stage import extract
 from pipeline.extract.thinning import ThinningConfig
@@ -37,6 +35,8 @@ from pipeline.files import write_atomic
 from pipeline.ingest.stage import IngestConfig, ingest
 from pipeline.mapping.sources import SourceConfig
 from pipeline.progress import Progress
+from pipeline.scoring.case import default_truth_gap_s
+from pipeline.scoring.scores import METRICS, PARTS, Cells, compare, groups_of
 from pipeline.tables import read_table
 from pipeline.windows import GridConfig, MissionWindows, build_windows, plan_grid, truth_on_grid
 

@@ -42,7 +42,7 @@ FLOORS = {
         {"frames", "stores", "logs", "mapping", "tracks"},
         {"missions", "checkpoints", "windows", "results"},
         {"catalogue", "associations"},
-        {"estimators"},
+        {"estimators", "scoring"},
         {"ingest", "extract", "infer", "export", "report", "simulate"},  # no stage imports another
         {"episodes"},
         {"forecast", "train"},

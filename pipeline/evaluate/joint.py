@@ -13,8 +13,8 @@ from torch import Tensor
 from cadence import metrics
 from cadence.types import HypothesisSet, WindowBatch
 from pipeline.arrays import Float64s, Int32s, Int64s
-from pipeline.evaluate.matching import matched
-from pipeline.evaluate.scores import PARTS, Draw, ScoreRow, detection_distances, weight_by_agent
+from pipeline.scoring.matching import matched
+from pipeline.scoring.scores import PARTS, Draw, ScoreRow, detection_distances, weight_by_agent
 
 JOINT_METRICS = (
     "joint_energy_score_m", "joint_min_ade_m", "gospa_m", "localisation_error_m", "num_missed", "num_false",

@@ -11,10 +11,10 @@ import numpy as np
 
 from pipeline.arrays import Int64s
 from pipeline.evaluate.joint import JOINT_METRICS, JointCells, block_of, summarise_joint
-from pipeline.evaluate.motion import MotionLaws, MotionSample, motion_rows
-from pipeline.evaluate.scores import PARTS, Cells, ScoreRow, energy_ratio, groups_of, summarise
 from pipeline.plain_rows import rows_as_csv, without_nan
 from pipeline.score_words import estimator_words
+from pipeline.scoring.motion import MotionLaws, MotionSample, motion_rows
+from pipeline.scoring.scores import PARTS, Cells, ScoreRow, energy_ratio, groups_of, summarise
 
 OWN_NAME = "cadence"
 """The estimator whose hypotheses a mission directory holds, in every table."""

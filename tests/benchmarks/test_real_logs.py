@@ -8,7 +8,7 @@ from benchmarks import real_logs
 from benchmarks.publishing import Measurement
 from benchmarks.real_logs import Result, draw_chart, section, table, tables
 from cadence.errors import CadenceError
-from pipeline.evaluate.scores import METRICS, PARTS
+from pipeline.scoring.scores import METRICS, PARTS
 
 
 def result(estimator: str, seed: int, energy: float, groups: tuple[str, ...] = ("a", "b", "c"), rate: float = 0.05) -> Result:

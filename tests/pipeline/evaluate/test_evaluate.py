@@ -15,9 +15,9 @@ from cadence.baselines.interpolation import GapLaw, Hold
 from cadence.errors import ConfigError, InputError
 from cadence.types import Detections, HypothesisSet, WindowBatch
 from pipeline.config import read_config
-from pipeline.evaluate.scores import METRICS, Cells, compare, energy_ratio, groups_of, score_cells, score_in_chunks, summarise
 from pipeline.evaluate.stage import EvaluateConfig, evaluate, evaluate_folder, score_mission
 from pipeline.progress import Progress
+from pipeline.scoring.scores import METRICS, Cells, compare, energy_ratio, groups_of, score_cells, score_in_chunks, summarise
 from pipeline.tables import Frame, read_table, write_table
 
 QUIET = Progress(quiet=True)
@@ -95,7 +95,7 @@ def test_chunks_do_not_change_the_cells(monkeypatch: pytest.MonkeyPatch) -> None
     truth, is_known = truth_of(windows)
     estimator = Hold(law=GapLaw(1.0, 0.5))
     whole = compare({"hold": estimator}, windows, truth, is_known, 6)["hold"]
-    monkeypatch.setattr("pipeline.evaluate.scores._MAX_STATES", 1)
+    monkeypatch.setattr("pipeline.scoring.scores._MAX_STATES", 1)
     seen: list[int] = []
     single = compare({"hold": estimator}, windows, truth, is_known, 6, after_chunk=seen.append)["hold"]
     assert seen == [1] * 5

@@ -2,8 +2,8 @@
 
 import pytest
 
-from pipeline.evaluate.scores import ScoreRow
 from pipeline.evaluate.tables import OWN_NAME, RatioRow, ScoreReport, as_markdown, verdict
+from pipeline.scoring.scores import ScoreRow
 
 
 def report(coverage: float, *ratios: tuple[str, float, float, float]) -> ScoreReport:

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from cadence.types import Detections, HypothesisSet, WindowBatch
-from pipeline.evaluate.motion import motion_rows, true_motion
-from pipeline.evaluate.scores import METRICS, score_cells
+from pipeline.scoring.motion import motion_rows, true_motion
+from pipeline.scoring.scores import METRICS, score_cells
 
 STEPS, ORIGIN, STEP_S = 40, 19, 2.0
 

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from cadence.types import HypothesisSet, WindowBatch
 from pipeline.arrays import Float64s
-from pipeline.evaluate.scores import Draw, ScoreRow, detection_distances, weight_by_agent
+from pipeline.scoring.scores import Draw, ScoreRow, detection_distances, weight_by_agent
 
 MOTION_METRICS = {"speed_w1_mps": "speed", "acceleration_w1_mps2": "acceleration", "turn_w1_deg": "turn"}
 """Wasserstein distances (order 1) of a law of the hypotheses to that of the truth on the same steps."""
