@@ -17,11 +17,11 @@ import torch
 
 from benchmarks import publishing
 from benchmarks.publishing import Measurement
-from cadence.diffusion.scene import SceneModel
+from cadence.diffusion.place import PlaceModel
 from cadence.recordings import ForecastWindows, cut_windows
 from cadence.worlds.rendezvous import RendezvousConfig, simulate_rendezvous_batch
 from pipeline.checkpoints import find_checkpoint
-from pipeline.estimators.scene import load_scene
+from pipeline.estimators.place import load_place_model
 
 AGENTS = (1, 2, 4, 8, 16, 32)
 NUM_HYPOTHESES = 30
@@ -31,7 +31,7 @@ def main() -> None:
     """Measure, print, publish."""
     options = _options()
     torch.set_num_threads(1)
-    together = load_scene(find_checkpoint(options.checkpoint))
+    together = load_place_model(find_checkpoint(options.checkpoint))
     alone = _without_attention(together)
     rows = []
     for agents in AGENTS:
@@ -72,7 +72,7 @@ def _options() -> argparse.Namespace:
     return parser.parse_args()
 
 
-def _without_attention(model: SceneModel) -> SceneModel:
+def _without_attention(model: PlaceModel) -> PlaceModel:
     """The same weights, with agents that do not see each other."""
     config = dataclasses.replace(model.config, network=dataclasses.replace(model.config.network, attention_heads=0))
     network = config.build()

@@ -23,7 +23,7 @@ from pipeline.batch.config import RunConfig
 from pipeline.batch.run import run
 from pipeline.checkpoints import checkpoint_hash, find_checkpoint
 from pipeline.config import stage_config
-from pipeline.estimators.scene import load_scene, scene_grid
+from pipeline.estimators.place import load_place_model, place_grid
 from pipeline.files import hash_file
 from pipeline.progress import Progress
 from pipeline.simulate.stage import SimulateConfig, simulate
@@ -87,8 +87,8 @@ def run_batches(folder: Path, num_workers: int) -> Batches:
 def window_rows(detections_path: Path, num_hypotheses: int = 30) -> list[publishing.Row]:
     """A row for each number of windows that are drawn together: processor time a window, and whether the bits are the same."""
     detections, _ = read_table(detections_path, "detections")
-    model = load_scene(find_checkpoint("prison"))
-    windows = build_windows(detections, plan_grid(detections, scene_grid(model.config, 1)), 0)
+    model = load_place_model(find_checkpoint("prison"))
+    windows = build_windows(detections, plan_grid(detections, place_grid(model.config, 1)), 0)
     batch = windows.located(int(detections["time_ns"][0].as_py()), Obstacles.none()).batch
     count = min(max(SIZES), windows.batch.num_windows)
 

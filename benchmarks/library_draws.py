@@ -21,11 +21,11 @@ import torch
 from benchmarks import publishing
 from benchmarks.leads import relative_lead
 from benchmarks.publishing import Measurement
-from cadence.diffusion.scene import SceneSampling
+from cadence.diffusion.place import PlaceSampling
 from cadence.types import Detections, Estimator, HypothesisSet, WindowBatch
 from pipeline.checkpoints import checkpoint_hash, find_checkpoint
 from pipeline.episodes.recordings import RecordingsConfig, RecordingSet, load_recordings
-from pipeline.estimators.scene import load_scene
+from pipeline.estimators.place import load_place_model
 from pipeline.forecast.rivals import FORECAST_RIVALS
 from pipeline.forecast.scores import HORIZONS, EpisodeScores
 from pipeline.forecast.stage import ForecastConfig, ForecastRun, forecast_windows
@@ -91,12 +91,12 @@ def score_case(case: Case, episodes: RecordingSet, options: argparse.Namespace, 
     config = ForecastConfig(options.windows, options.hypotheses, rivals=(), known_goal=False)
     windows = forecast_windows(episodes.recordings, config)
     run = ForecastRun(episodes, windows, options.hypotheses, options.work / "scores", progress, tells_obstacles=False)
-    weights, sampling = find_checkpoint(case.world), SceneSampling(precision="bfloat16")
+    weights, sampling = find_checkpoint(case.world), PlaceSampling(precision="bfloat16")
     trained = [checkpoint_hash(weights), sampling]
 
     @functools.cache
     def network() -> Estimator:
-        return load_scene(weights, sampling)
+        return load_place_model(weights, sampling)
 
     @functools.cache
     def library(count: int) -> Estimator:

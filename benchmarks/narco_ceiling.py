@@ -25,7 +25,7 @@ from benchmarks.publishing import Measurement
 from benchmarks.table1 import EVALUATION_SEED
 from benchmarks.table1_page import LATE, NAMES, measure_rows
 from cadence.bank.rows import active_rows, scatter_hypotheses
-from cadence.diffusion.scene import SceneSampling
+from cadence.diffusion.place import PlaceSampling
 from cadence.errors import CadenceError
 from cadence.recordings import Recordings
 from cadence.types import Detections, Estimator, HypothesisSet, WindowBatch
@@ -111,7 +111,7 @@ def rows_of(name: Literal["low", "high"], setup: Setup) -> tuple[dict[str, Episo
     episodes = load_recordings(of(seed=EVALUATION_SEED, num_episodes=setup.num_episodes), cache, setup.progress)
     windows = forecast_windows(episodes.recordings, setup.config)
     run = ForecastRun(episodes, windows, setup.config.num_hypotheses, setup.work / "scores", setup.progress)
-    samplings = Samplings(paper=setup.config.paper, scene=setup.config.scene)
+    samplings = Samplings(paper=setup.config.paper, place=setup.config.place)
 
     def training(num: int) -> Recordings:
         return load_recordings(of(seed=TRAINING_SEED, num_episodes=num), cache, setup.progress).recordings
@@ -179,7 +179,7 @@ def main() -> int:
     parser.add_argument("--publish", type=Path, metavar="DOCS", help="write numbers and section below this folder")
     args = parser.parse_args()
     torch.set_num_threads(1)
-    config = ForecastConfig(args.windows, scene=SceneSampling(precision="bfloat16"))
+    config = ForecastConfig(args.windows, place=PlaceSampling(precision="bfloat16"))
     setup = Setup(args.work, args.episodes, args.training_episodes, config, Progress())
     found = {name: rows_of(name, setup) for name in SETS}
     facts = publishing.facts_of("narco_ceiling") | {

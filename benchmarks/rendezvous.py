@@ -30,7 +30,7 @@ from cadence import metrics
 from cadence.arrays import Float64s, Int64s
 from cadence.association.associate import associate
 from cadence.association.types import AssociationConfig
-from cadence.diffusion.scene import SceneModel, SceneSampling
+from cadence.diffusion.place import PlaceModel, PlaceSampling
 from cadence.recordings import ForecastWindows, choose_windows, cut_windows
 from cadence.resampling import systematic
 from cadence.types import Detections, HypothesisSet, WindowBatch
@@ -38,12 +38,12 @@ from cadence.worlds.joint import JointRecordings, meets
 from cadence.worlds.rendezvous import RendezvousConfig, simulate_rendezvous, simulate_rendezvous_batch
 from cadence.worlds.rendezvous_map import GOALS_M, SITES_M
 from pipeline.checkpoints import checkpoint_hash, find_checkpoint
-from pipeline.estimators.scene import load_scene
+from pipeline.estimators.place import load_place_model
 from pipeline.provenance import versions
 
 MINUTES = (0, 30, 60, 90, 120)
 NUM_HYPOTHESES = 30
-SAMPLING = SceneSampling(precision="bfloat16")
+SAMPLING = PlaceSampling(precision="bfloat16")
 APART_M = 4000.0
 SOON_M = 1500.0
 """Agents nearer to a site than this are not shown in the picture: that they meet is no question any more."""
@@ -141,7 +141,7 @@ def drawn(row: Row, windows: ForecastWindows, episodes: JointRecordings, options
     path = options.work / f"{hashlib.sha256(repr(key).encode()).hexdigest()[:16]}.npy"
     if path.is_file():
         return equally_likely(torch.from_numpy(np.load(path)).double())
-    model = load_scene(weights, SAMPLING)
+    model = load_place_model(weights, SAMPLING)
     if row.is_told_apart:
         found = told_apart(model, windows, episodes)
     else:
@@ -159,7 +159,7 @@ def equally_likely(position: Tensor) -> HypothesisSet:
     return HypothesisSet(position, weight, (("ok",) * position.shape[2],) * len(position))
 
 
-def told_apart(model: SceneModel, windows: ForecastWindows, episodes: JointRecordings) -> HypothesisSet:
+def told_apart(model: PlaceModel, windows: ForecastWindows, episodes: JointRecordings) -> HypothesisSet:
     """Hypotheses for windows whose detections say nothing of their agents; each way of telling them apart has its share.
 
     An agent to which a way gives no detection stands where something was seen last.

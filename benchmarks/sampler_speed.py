@@ -28,7 +28,7 @@ from cadence.bank.bank import BankPosterior
 from cadence.bank.rows import active_rows, scatter_hypotheses
 from cadence.constraints.checker import segments_in_collision
 from cadence.constraints.obstacles import Obstacles
-from cadence.diffusion.feasible import Feasibility, Place
+from cadence.diffusion.feasible import Feasibility, KeepOut
 from cadence.diffusion.general import GeneralModel
 from cadence.diffusion.guidance import PaperCost, adam_guidance
 from cadence.diffusion.sampler import sample_ddpm
@@ -72,7 +72,7 @@ class Case:
 
     @property
     def datum_m(self) -> Tensor:
-        """Place of every row's datum in the obstacles' frame [R, 1, 1, 2]."""
+        """KeepOut of every row's datum in the obstacles' frame [R, 1, 1, 2]."""
         window = self.windows.batch.is_active.nonzero()[:, 0]
         return torch.from_numpy(self.windows.datum_m)[window][:, None, None]
 
@@ -262,7 +262,7 @@ class Variant:
 def network_seconds(case: Case, sampler: str, num_steps: int) -> float:
     """Processor seconds of the default's sampling alone: no bank, no repair; guided as in `infer`."""
     posterior, context = bank_context(case)
-    limits = Feasibility(Place(case.obstacles, 0.0, case.datum_m), case.windows.batch.step_s)
+    limits = Feasibility(KeepOut(case.obstacles, 0.0, case.datum_m), case.windows.batch.step_s)
     model = dataclasses.replace(case.model, sampler=sampler, num_steps=num_steps)
     begin = time.process_time()
     model._denoise(posterior, context, limits.guide)

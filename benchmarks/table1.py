@@ -33,7 +33,7 @@ from benchmarks.leads import averaged
 from benchmarks.publishing import Measurement
 from benchmarks.table1_page import MIXTURES, NAMES, Evaluated, Found, section, tables
 from cadence.diffusion.absolute import AbsoluteSampling
-from cadence.diffusion.scene import SceneSampling
+from cadence.diffusion.place import PlaceSampling
 from cadence.errors import CadenceError, InputError
 from cadence.recordings import Recordings
 from cadence.types import Estimator
@@ -148,7 +148,7 @@ def _rival(name: str, sources: Sequence[RecordingsConfig], training: Callable[..
 def _learned(name: str, case: Case, paths: Sequence[Path], run: ForecastRun, setup: Setup, goal: bool) -> Found | None:
     """Scores of all trainings of a method; None without any, or where it is not for windows with or without a known goal."""
     parts, budgets = [], []
-    samplings = Samplings(paper=setup.config.paper, scene=setup.config.scene)
+    samplings = Samplings(paper=setup.config.paper, place=setup.config.place)
     for path in paths:
         info = read_info(path)
         is_reader = reads_goal(info.network)
@@ -230,8 +230,8 @@ def main(name: str = "table1", section: Callable[[Measurement], str] = section) 
     """Evaluate, print and publish."""
     args = arguments()
     sampling = AbsoluteSampling(sampler=args.paper_sampler, inpainting="overwrite")
-    scene = SceneSampling(precision=args.precision)
-    config = ForecastConfig(args.windows, args.hypotheses, rivals=(), paper=sampling, scene=scene)
+    place = PlaceSampling(precision=args.precision)
+    config = ForecastConfig(args.windows, args.hypotheses, rivals=(), paper=sampling, place=place)
     setup = Setup(args.checkpoints, tuple(args.methods), args.work, config, Progress(args.quiet))
     cases = list(world_cases(args.episodes, args.training_episodes, args.all_episodes))
     if args.reference is not None:

@@ -39,8 +39,8 @@ from pipeline.forecast.scores import HORIZONS, EpisodeScores
 from pipeline.forecast.stage import ForecastConfig, ForecastRun, forecast_windows
 from pipeline.progress import Progress
 from pipeline.train.config import TrainConfig
+from pipeline.train.place import train_place_network
 from pipeline.train.rivals import train_rival
-from pipeline.train.scene import train_scene_network
 
 World = Literal["prison", "narco"]
 WORLDS: tuple[World, ...] = ("prison", "narco")
@@ -102,10 +102,10 @@ def train_config(method: str, world: World, seed: int, setup: Setup) -> TrainCon
     start = setup.training("grammi_without_mi", world, seed) / "checkpoint.safetensors" if method == "grammi" else None
     sources = (training_source(world),)
     rival = dataclasses.replace(config.rival, start=start, sources=sources, tuning_steps=max(1, steps // 6))
-    scene = dataclasses.replace(config.scene, sources=tuple(EpisodeSource(1.0, source) for source in sources))
+    place = dataclasses.replace(config.place, sources=tuple(EpisodeSource(1.0, source) for source in sources))
     every = max(1, steps // 5)
     return dataclasses.replace(
-        config, seed=seed, batch_size=batch_size, optimiser=optimiser, rival=rival, scene=scene, validate_every=every,
+        config, seed=seed, batch_size=batch_size, optimiser=optimiser, rival=rival, place=place, validate_every=every,
         save_every=min(100, every),
     )  # fmt: skip
 
@@ -128,9 +128,9 @@ def train(method: str, world: World, seed: int, setup: Setup, episodes: tuple[Re
     if method != "cadence":
         train_rival(out, config, *episodes, setup.progress)
         return
-    network = untrained(config.scene.model.build, seed)
+    network = untrained(config.place.model.build, seed)
     pools = [EpisodePool((part,), (1.0,)) for part in episodes]
-    train_scene_network(out, config, network, *pools, setup.progress)
+    train_place_network(out, config, network, *pools, setup.progress)
 
 
 def evaluation_run(world: World, setup: Setup) -> ForecastRun:
@@ -144,7 +144,7 @@ def evaluation_run(world: World, setup: Setup) -> ForecastRun:
 def scores_of(world: World, run: ForecastRun, setup: Setup) -> Scores:
     """Of every training that is done."""
     found: Scores = {}
-    samplings = Samplings(paper=setup.config.paper, scene=setup.config.scene)
+    samplings = Samplings(paper=setup.config.paper, place=setup.config.place)
     for method in METHODS:
         for seed in setup.seeds:
             path = setup.training(method, world, seed) / "checkpoint.safetensors"

@@ -5,8 +5,8 @@ from .constraints.obstacles import Obstacles
 from .diffusion.absolute import AbsoluteModel
 from .diffusion.feasible import GuidanceConfig
 from .diffusion.general import GeneralModel
+from .diffusion.place import PlaceModel
 from .diffusion.sampler import sample_ddim, sample_ddpm, sample_dpmpp_2m, sample_rotation
-from .diffusion.scene import SceneModel
 from .errors import CadenceError
 from .metrics import ade, coverage, energy_score, mean_error, min_ade
 from .recordings import Recordings, cut_windows
@@ -28,8 +28,8 @@ __all__ = [
     "Obstacles",
     "OptimiserConfig",
     "OrnsteinUhlenbeckKalman",
+    "PlaceModel",
     "Recordings",
-    "SceneModel",
     "TrajectoryLibrary",
     "WindowBatch",
     "ade",

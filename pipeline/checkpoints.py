@@ -42,13 +42,13 @@ DEFAULT = "general"
 class CheckpointInfo:
     """The JSON beside the weights.
 
-    preset    "general", "paper", "scene", or a rival's
+    preset    "general", "paper", "place" ("scene" in 0.3), or a rival's
     network   the network's configuration
     training  command, seed, steps and data that made it
     scores    what validation measured
     """
 
-    preset: str
+    preset: str = field(metadata={"older_values": {"scene": "place"}})
     network: dict[str, Any]
     training: dict[str, Any] = field(default_factory=dict)
     scores: dict[str, Any] = field(default_factory=dict)

@@ -1,6 +1,7 @@
 """Strict configuration: frozen dataclasses read from TOML tables and `--set a.b=value`, through one reader.
 
-An unknown key is an error that names the known ones; a value of the wrong type is an error that names the right one.
+An unknown key is an error that names the known ones; a value of the wrong type is an error that names the right one. What was
+called otherwise in earlier versions is still read: a field says so in its metadata, see `_by_names_of_today`.
 """
 
 import dataclasses
@@ -130,6 +131,7 @@ def read_config(cls: type[T], tables: Mapping[str, Any], where: str = "config") 
     """An instance of the frozen dataclass `cls` from TOML tables; missing keys take their defaults."""
     fields = {field.name: field for field in dataclasses.fields(cls)}  # type: ignore[arg-type]
     hints = typing.get_type_hints(cls)
+    tables = _by_names_of_today(fields, tables, where)
     unknown = [key for key in tables if key not in fields]
     if unknown:
         meant = did_you_mean(unknown[0], fields) or _elsewhere(hints, unknown[0])
@@ -146,6 +148,22 @@ def read_config(cls: type[T], tables: Mapping[str, Any], where: str = "config") 
         return cls(**values)
     except ValueError as error:
         raise ConfigError(f"{where}: {error}") from error
+
+
+def _by_names_of_today(fields: Mapping[str, Any], tables: Mapping[str, Any], where: str) -> dict[str, Any]:
+    """The table with the names that keys and values have today.
+
+    metadata of a field: `older_name` is what the key was called, `older_values` maps what values were called to what they are.
+    """
+    newer = {field.metadata["older_name"]: name for name, field in fields.items() if "older_name" in field.metadata}
+    found: dict[str, Any] = {}
+    for key, value in tables.items():
+        name = newer.get(key, key)
+        if name != key and name in tables:
+            raise ConfigError(f"{where}: {key!r} is the older name of {name!r}; give one of the two")
+        older_values = fields[name].metadata.get("older_values", {}) if name in fields else {}
+        found[name] = older_values.get(value, value) if isinstance(value, str) else value
+    return found
 
 
 def changed_settings(config: object) -> list[str]:

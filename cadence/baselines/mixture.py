@@ -66,7 +66,7 @@ class GaussianMixture:
     def sample(self, num_hypotheses: int, seeds: Tensor) -> Tensor:
         """Draws [B, K, H, 2], metres, independent between horizons; a window's depend on its seed (seeds [B]) alone.
 
-        They are spread as evenly as those of the scene model, so that no score tells the way of drawing: in pairs of one
+        They are spread as evenly as those of the place model, so that no score tells the way of drawing: in pairs of one
         component with mirrored noise, the components drawn systematically.
         """
         k, h = num_hypotheses, self.weight.shape[1]

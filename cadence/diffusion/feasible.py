@@ -28,7 +28,7 @@ class GuidanceConfig:
     """How constraints act on hypotheses.
 
     mode           "clean" guides while sampling and repairs at the end; "repair" only repairs; "none" ignores constraints;
-                   of the scene preset only "none" counts (infer.scene says how it guides), and the paper preset has infer.paper
+                   of the place preset only "none" counts (infer.place says how it guides), and the paper preset has infer.paper
     margin_m       distance to keep from obstacles
     max_speed_mps  a speed that the target cannot exceed; None = no limit
     """
@@ -43,7 +43,7 @@ class GuidanceConfig:
 
 
 @dataclass(frozen=True, eq=False)
-class Place:
+class KeepOut:
     """What is in the way: obstacles, the margin to keep from them, and the datum of the rows in their frame [R, 1, 1, 2]."""
 
     obstacles: Obstacles
@@ -55,14 +55,14 @@ class Place:
 class Feasibility:
     """What hypotheses must obey.
 
-    place          what is in the way; its obstacles may be none
+    keep_out       what is in the way; its obstacles may be none
     step_s         of the grid
     max_speed_mps  that is stated, None for no limit
     plausible_speed_mps  what the log's own detections let one believe; tracks keep it, but are not guided by it
     num_steps      of guidance on each clean estimate
     """
 
-    place: Place
+    keep_out: KeepOut
     step_s: float
     max_speed_mps: float | None = None
     plausible_speed_mps: float | None = None
@@ -75,15 +75,15 @@ class Feasibility:
         datum_m = torch.zeros(windows.num_windows, 2, dtype=torch.float64) if context is None else context.datum_m
         offset_m = datum_m[windows.is_active.nonzero()[:, 0], None, None]
         if config.mode == "none":
-            return cls(Place(Obstacles.none(), 0.0, offset_m), windows.step_s)
+            return cls(KeepOut(Obstacles.none(), 0.0, offset_m), windows.step_s)
         obstacles = Obstacles.none() if context is None else context.obstacles
-        place = Place(obstacles, config.margin_m, offset_m)
-        return cls(place, windows.step_s, config.max_speed_mps, plausible_speed_mps)
+        keep_out = KeepOut(obstacles, config.margin_m, offset_m)
+        return cls(keep_out, windows.step_s, config.max_speed_mps, plausible_speed_mps)
 
     @property
     def is_stated(self) -> bool:
         """Whether there is anything to be guided by."""
-        return self.place.obstacles.count > 0 or self.max_speed_mps is not None
+        return self.keep_out.obstacles.count > 0 or self.max_speed_mps is not None
 
     @property
     def longest_m(self) -> float | None:
@@ -94,8 +94,9 @@ class Feasibility:
     def guide(self, position_m: Tensor, sigma_m: Tensor, rows: slice) -> Tensor:
         """Clean estimates [R', K, T, 2] moved towards the feasible, as far as the bank is uncertain there."""
         constraints: list[Constraint] = []
-        if self.place.obstacles.count:
-            constraints.append(ObstacleConstraint(self.place.obstacles, self.place.margin_m, self.place.offset_m[rows]))
+        keep_out = self.keep_out
+        if keep_out.obstacles.count:
+            constraints.append(ObstacleConstraint(keep_out.obstacles, keep_out.margin_m, keep_out.offset_m[rows]))
         if self.max_speed_mps is not None:
             constraints.append(SpeedConstraint(self.max_speed_mps, self.step_s))
         return clean_estimate_guidance(position_m, constraints, sigma_m[:, None, :, None], self.num_steps)
@@ -110,7 +111,7 @@ class Feasibility:
             less — and which of them are to be kept [R, K]: those within all limits, or where there are none in a row, those
             that are only faster than is plausible; none at all where every one breaks what was stated.
         """
-        if not self.place.obstacles.count and self.longest_m is None:
+        if not self.keep_out.obstacles.count and self.longest_m is None:
             even = torch.full(position_m.shape[:2], 1.0 / position_m.shape[1], dtype=torch.float64)
             return position_m, even, torch.ones_like(even, dtype=torch.bool)
         moved, is_feasible = self._within_limits(position_m, sigma_m, length_m)
@@ -128,20 +129,20 @@ class Feasibility:
         is_pinned = (sigma_m <= _PINNED_SHARE * length_m)[:, None].expand(position_m.shape[:3])
         is_held = (sigma_m <= _HELD_SHARE * length_m) | (sigma_m == sigma_m.amin(dim=1, keepdim=True))
         held = is_held[:, None].expand(position_m.shape[:3])
-        moved, is_feasible = within_limits(position_m, self.place, is_pinned, self.longest_m, held)
+        moved, is_feasible = within_limits(position_m, self.keep_out, is_pinned, self.longest_m, held)
         if self.max_speed_mps is not None:
             is_feasible = is_feasible & ~exceeds(moved, self.max_speed_mps * self.step_s)
         return moved, is_feasible
 
 
 def within_limits(
-    position_m: Tensor, place: Place, is_pinned: Tensor, longest_m: float | None, is_held: Tensor
+    position_m: Tensor, keep_out: KeepOut, is_pinned: Tensor, longest_m: float | None, is_held: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Tracks [R, K, T, 2] led around obstacles and slowed down, in turns as often as helps: the one may undo the other.
 
     Args:
         position_m: the tracks.
-        place: what is in the way.
+        keep_out: what is in the way.
         is_pinned: [R, K, T] steps that a way round an obstacle leaves exactly where they are.
         longest_m: how long a step may be, or None.
         is_held: [R, K, T] steps that stay where they are when a track is slowed down; at least one a track.
@@ -150,12 +151,12 @@ def within_limits(
         The tracks, and which of them keep clear of the obstacles [R, K]; ask `exceeds` whether they are slow enough.
     """
     moved, is_clear = position_m, torch.ones(position_m.shape[:2], dtype=torch.bool)
-    for _ in range(_ROUNDS if place.obstacles.count and longest_m is not None else 1):
+    for _ in range(_ROUNDS if keep_out.obstacles.count and longest_m is not None else 1):
         if longest_m is not None:
             slowed, _ = limit_steps(moved.flatten(0, 1), is_held.flatten(0, 1), longest_m)
             moved = slowed.view_as(moved)
-        if place.obstacles.count:
-            moved, is_clear = repair(moved, place.obstacles, is_pinned, place.margin_m, offset_m=place.offset_m)
+        if keep_out.obstacles.count:
+            moved, is_clear = repair(moved, keep_out.obstacles, is_pinned, keep_out.margin_m, offset_m=keep_out.offset_m)
         if longest_m is None or not bool((exceeds(moved, longest_m) | ~is_clear).any()):
             break
     return moved, is_clear

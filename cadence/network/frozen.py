@@ -10,18 +10,18 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from cadence.network.attention import Team
-from cadence.network.scene import Pieces, SceneInputs, SceneNetwork
+from cadence.network.place import Pieces, PlaceInputs, PlaceNetwork
 from cadence.network.unet import UNet, _Block
 
 
-class FrozenScene:
-    """The function of a scene network; see `FrozenUNet`."""
+class FrozenPlace:
+    """The function of a place network; see `FrozenUNet`."""
 
-    def __init__(self, network: SceneNetwork, dtype: torch.dtype = torch.float32) -> None:
+    def __init__(self, network: PlaceNetwork, dtype: torch.dtype = torch.float32) -> None:
         self.network = network
         self.unet = FrozenUNet(network.unet, dtype)
 
-    def known(self, inputs: SceneInputs) -> list[Tensor]:
+    def known(self, inputs: PlaceInputs) -> list[Tensor]:
         """What R windows tell the blocks of the U-Net, whatever the noise level [R, *] each."""
         return self.unet.shares(self.network.encode(inputs))
 

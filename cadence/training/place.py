@@ -8,19 +8,19 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
-from cadence.diffusion.scene import SceneModel, SceneSampling
-from cadence.diffusion.scene_frame import SceneConfig
-from cadence.network.scene import SceneNetwork, SceneNetworkConfig
+from cadence.diffusion.place import PlaceModel, PlaceSampling
+from cadence.diffusion.place_frame import PlaceConfig
+from cadence.network.place import PlaceNetwork, PlaceNetworkConfig
 from cadence.recordings import Recordings
 from cadence.seeds import numpy_stream, torch_stream
 from cadence.training.loop import OptimiserConfig, Trainer, untrained
-from cadence.training.scene import Dropout, diffusion_loss, scene_windows
+from cadence.training.place_losses import Dropout, diffusion_loss, place_windows
 
 _ROOM = 1.05
 """Map and step limits are those of the recordings with this much room."""
 
 
-def place_config(recordings: Recordings, network: SceneNetworkConfig | None = None) -> SceneConfig:
+def place_config(recordings: Recordings, network: PlaceNetworkConfig | None = None) -> PlaceConfig:
     """Map, units and limits of a place as the recordings show them.
 
     Args:
@@ -35,8 +35,8 @@ def place_config(recordings: Recordings, network: SceneNetworkConfig | None = No
     if not (high > low).any() or not len(step_m):
         raise ValueError("place_config: nothing moves in these recordings")
     middle = 0.5 * (low + high)
-    return SceneConfig(
-        network or SceneNetworkConfig(),
+    return PlaceConfig(
+        network or PlaceNetworkConfig(),
         recordings.step_s,
         (float(middle[0]), float(middle[1])),
         float(0.5 * _ROOM * (high - low).max()),
@@ -47,12 +47,12 @@ def place_config(recordings: Recordings, network: SceneNetworkConfig | None = No
 
 def train_place(
     recordings: Recordings,
-    config: SceneConfig | None = None,
+    config: PlaceConfig | None = None,
     optimiser: OptimiserConfig | None = None,
     batch_size: int = 64,
     seed: int = 0,
     on_step: Callable[[int, float], object] | None = None,
-) -> SceneModel:
+) -> PlaceModel:
     """An estimator that forecasts in a place whose tracks it has learned; the same seed gives the same weights.
 
     Args:
@@ -68,16 +68,16 @@ def train_place(
     for step in range(trainer.config.num_steps):
         rng = numpy_stream(seed, "windows", step)
         rows = rng.integers(0, len(recordings.position_m), batch_size)
-        windows = scene_windows(recordings, rows, config, Dropout(), rng)
+        windows = place_windows(recordings, rows, config, Dropout(), rng)
         generator = torch_stream(seed, "step", step)
 
         def loss(network: torch.nn.Module) -> torch.Tensor:
-            assert isinstance(network, SceneNetwork)
+            assert isinstance(network, PlaceNetwork)
             return diffusion_loss(network, windows, config, 1.0, generator)  # noqa: B023 - is called at once
 
         value = trainer.advance(loss)
         if on_step is not None:
             on_step(step, value)
     learned = trainer.ema.network
-    assert isinstance(learned, SceneNetwork)
-    return SceneModel(learned.eval(), config, SceneSampling())
+    assert isinstance(learned, PlaceNetwork)
+    return PlaceModel(learned.eval(), config, PlaceSampling())

@@ -15,8 +15,8 @@ from pipeline.estimators.general import load_general
 from pipeline.estimators.loaded import Loaded
 from pipeline.estimators.mixtures import RIVALS, load_mixture
 from pipeline.estimators.paper import load_paper
+from pipeline.estimators.place import load_place
 from pipeline.estimators.samplings import Samplings
-from pipeline.estimators.scene import load_place
 
 NO_CHECKPOINT = "none"
 """Stands for the bank alone where a checkpoint is named."""
@@ -50,7 +50,7 @@ _BANK = ("grid.", "guidance.")
 
 PRESETS: Mapping[str, Preset] = {
     "general": Preset(load_general, ("sampler", "num_steps", "is_gated", *_BANK), ("cpu", "cuda"), forecasts=False),
-    "scene": Preset(load_place, ("scene.", "guidance.")),
+    "place": Preset(load_place, ("place.", "guidance.")),
     "paper": Preset(load_paper, ("paper.",)),
     **dict.fromkeys(RIVALS, Preset(load_mixture, infers=False)),
 }

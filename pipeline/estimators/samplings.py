@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from cadence.diffusion.absolute import AbsoluteSampling
 from cadence.diffusion.feasible import GuidanceConfig
 from cadence.diffusion.general import SamplerName
-from cadence.diffusion.scene import SceneSampling
+from cadence.diffusion.place import PlaceSampling
 
 
 @dataclass(frozen=True)
@@ -25,12 +25,12 @@ class GeneralSampling:
 class Samplings:
     """Settings by preset, and those that concern several.
 
-    guidance  how constraints act (general, and as far as it says so, scene)
+    guidance  how constraints act (general, and as far as it says so, place)
     device    where networks run
     """
 
     general: GeneralSampling = field(default_factory=GeneralSampling)
     paper: AbsoluteSampling = field(default_factory=AbsoluteSampling)
-    scene: SceneSampling = field(default_factory=SceneSampling)
+    place: PlaceSampling = field(default_factory=PlaceSampling)
     guidance: GuidanceConfig = field(default_factory=GuidanceConfig)
     device: str = "auto"

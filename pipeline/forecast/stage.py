@@ -22,7 +22,7 @@ from torch import Tensor
 
 from cadence.constraints.obstacles import Obstacles
 from cadence.diffusion.absolute import AbsoluteSampling
-from cadence.diffusion.scene import SceneSampling
+from cadence.diffusion.place import PlaceSampling
 from cadence.errors import ConfigError, InputError
 from cadence.recordings import ForecastWindows, Recordings, choose_windows, cut_windows
 from cadence.types import Detections, Estimator, HypothesisSet, WindowBatch
@@ -63,7 +63,7 @@ class ForecastConfig:
     seed            of the choice of windows, of the hypotheses and of the bootstrap
     recordings      how episodes are read from the logs; the folder of the call is its data
     training        episodes that the rivals learn from; needed by all of them
-    paper, scene    how checkpoints of these presets are sampled
+    paper, place    how checkpoints of these presets are sampled; scene, the older name of place, is still read
     """
 
     num_windows: int = 2000
@@ -79,7 +79,7 @@ class ForecastConfig:
     recordings: RecordingsConfig = field(default_factory=RecordingsConfig)
     training: RecordingsConfig | None = None
     paper: AbsoluteSampling = field(default_factory=AbsoluteSampling)
-    scene: SceneSampling = field(default_factory=SceneSampling)
+    place: PlaceSampling = field(default_factory=PlaceSampling, metadata={"older_name": "scene"})
 
     def __post_init__(self) -> None:
         unknown = [name for name in self.rivals if name not in FORECAST_RIVALS]
@@ -108,7 +108,7 @@ def evaluate_forecasts(
     Raises `InputError` where no log can be used, `ConfigError` for a checkpoint that is not there or does not forecast.
     """
     names = tuple(dict.fromkeys([checkpoint, *config.checkpoints]))
-    samplings = Samplings(paper=config.paper, scene=config.scene)
+    samplings = Samplings(paper=config.paper, place=config.place)
     estimators = {label_of(name): load_forecaster(name, samplings) for name in names}
     if len(estimators) < len(names):
         raise ConfigError(f"evaluate.forecast.checkpoints: two of {', '.join(names)} have the same name; rename one")
@@ -130,7 +130,7 @@ def evaluate_forecasts(
             assert config.training is not None  # refused by the configuration
             return load_recordings(config.training, cache, progress).recordings.apart()
 
-        settings = [config.paper, config.scene]
+        settings = [config.paper, config.place]
         scores = {
             label: run.score(label, functools.partial(_same, estimators[label]), [checkpoint_hash(path), *settings])
             for label, path in zip(estimators, weights, strict=True)

@@ -6,7 +6,7 @@ from cadence.association.types import AssociationConfig
 from cadence.diffusion.absolute import AbsoluteSampling
 from cadence.diffusion.feasible import GuidanceConfig
 from cadence.diffusion.general import SamplerName
-from cadence.diffusion.scene import SceneSampling
+from cadence.diffusion.place import PlaceSampling
 from pipeline.checkpoints import DEFAULT
 from pipeline.estimators.samplings import GeneralSampling, Samplings
 from pipeline.windows import GridConfig
@@ -24,7 +24,8 @@ class InferConfig:
     default_sigma_m  accuracy of detections that state none
     device           "auto", "cpu" or "cuda"
     paper            how a checkpoint of the paper preset is sampled; it brings its own grid
-    scene            how a checkpoint of the scene preset is sampled; it brings its own grid
+    place            how a checkpoint of the place preset is sampled; it brings its own grid. Its older name, scene, is still
+                     read
     is_gated         of the general preset: the network moves all, half or none of the hypotheses, as withheld detections of
                      this log advise
     is_associated    detections of unknown origin are told apart; otherwise they are taken for one agent called "unknown"
@@ -44,7 +45,7 @@ class InferConfig:
     grid: GridConfig = field(default_factory=GridConfig)
     guidance: GuidanceConfig = field(default_factory=GuidanceConfig)
     paper: AbsoluteSampling = field(default_factory=AbsoluteSampling)
-    scene: SceneSampling = field(default_factory=SceneSampling)
+    place: PlaceSampling = field(default_factory=PlaceSampling, metadata={"older_name": "scene"})
 
     def __post_init__(self) -> None:
         is_few = self.num_hypotheses < 1 or (self.num_steps is not None and self.num_steps < 1)
@@ -56,4 +57,4 @@ class InferConfig:
         """What checkpoints are loaded with."""
         default = GeneralSampling()
         general = GeneralSampling(self.sampler or default.sampler, self.num_steps or default.num_steps, self.is_gated)
-        return Samplings(general, self.paper, self.scene, self.guidance, self.device)
+        return Samplings(general, self.paper, self.place, self.guidance, self.device)

@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, Literal, Protocol
 
 from cadence.errors import ConfigError
@@ -46,8 +46,8 @@ class SourceConfig:
     """One `[[extract.detections]]`, `[[extract.truth]]` or `[[extract.poses]]` entry.
 
     topic       exact, or with `{agent}` and/or `{sensor}` in place of a part of a name (`/truth/{agent}`)
-    message_type  a name of `pipeline.mapping.message_types`; without one and without paths it is chosen by the schema
-    preset      the older name of message_type, still read
+    message_type  a name of `pipeline.mapping.message_types`; without one and without paths the schema's; its older
+                name, preset, is still read
     agent, agent_path    who was seen: a constant, or a message path; neither (nor `{agent}`) means origin unknown
     has_identity   whether messages and topics say who was seen; true: believed as it stands, false: never; default: judged by
                    whether it can be meant
@@ -70,7 +70,7 @@ class SourceConfig:
     """
 
     topic: str
-    message_type: str | None = None
+    message_type: str | None = field(default=None, metadata={"older_name": "preset"})
     agent: str | None = None
     agent_path: str | None = None
     has_identity: bool | None = None
@@ -91,10 +91,8 @@ class SourceConfig:
     time: str | None = None
     frame_id: str | None = None
     frame_convention: Literal["enu", "ned"] | None = None
-    preset: str | None = None
 
     def __post_init__(self) -> None:
-        self._take_older_name()
         if self.message_type is not None and self.message_type not in MESSAGE_TYPES:
             raise ValueError(f"message_type {self.message_type!r} is not known; known: {', '.join(MESSAGE_TYPES)}")
         for name in _CHECKED:
@@ -107,14 +105,6 @@ class SourceConfig:
             raise ValueError(f"topic {self.topic!r}: sigma_m must be positive")
         self._check_position()
         self._check_identity()
-
-    def _take_older_name(self) -> None:
-        if self.preset is None:
-            return
-        if self.message_type is not None:
-            raise ValueError(f"topic {self.topic!r}: preset is the older name of message_type; give one of the two")
-        object.__setattr__(self, "message_type", self.preset)
-        object.__setattr__(self, "preset", None)
 
     def _check_position(self) -> None:
         if (self.x is None) != (self.y is None) or (self.latitude is None) != (self.longitude is None):

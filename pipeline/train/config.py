@@ -8,12 +8,12 @@ from cadence.baselines.grammi import GrammiNetworkConfig
 from cadence.baselines.mixture import MixtureFrame
 from cadence.baselines.vrnn import VrnnNetworkConfig
 from cadence.diffusion.absolute import AbsoluteConfig
-from cadence.diffusion.scene_frame import SceneConfig
+from cadence.diffusion.place_frame import PlaceConfig
 from cadence.network.residual import ResidualNetworkConfig
 from cadence.network.trajectory import TrajectoryNetworkConfig
 from cadence.recordings import NUM_STEPS
 from cadence.training.loop import OptimiserConfig
-from cadence.training.scene import Dropout
+from cadence.training.place_losses import Dropout
 from cadence.training.synthetic import SyntheticConfig
 from cadence.worlds.patrol import PatrolConfig
 from pipeline.episodes.pool import EpisodeSource
@@ -111,8 +111,8 @@ def _validation() -> tuple[EpisodeSource, ...]:
 
 
 @dataclass(frozen=True)
-class SceneTraining:
-    """What the scene preset is trained on, and for what.
+class PlaceTraining:
+    """What the place preset is trained on, and for what.
 
     model           sizes, inputs and units; few_steps is set by the objective "energy"
     objective       "diffusion" (noise levels at random), or "energy": a few-step sampler tuned by the energy score
@@ -127,7 +127,7 @@ class SceneTraining:
     score_weights   of the whole track and of single pieces beside the positions, for "energy"
     """
 
-    model: SceneConfig = field(default_factory=SceneConfig)
+    model: PlaceConfig = field(default_factory=PlaceConfig)
     objective: Literal["diffusion", "energy"] = "diffusion"
     start: str | None = None
     sources: tuple[EpisodeSource, ...] = field(default_factory=_worlds)
@@ -196,7 +196,7 @@ class RivalTraining:
 class TrainConfig:
     """What to train, on what, for how long.
 
-    preset            "general" (residual of the bank), "paper" (absolute coordinates, the published architecture), "scene" (one
+    preset            "general" (residual of the bank), "paper" (absolute coordinates, the published architecture), "place" (one
                       place learned by heart), or one of the paper's rivals: "vrnn", "grammi_without_mi", "grammi" (which
                       trains the one without first)
     data              folder of MCAP logs with truth; None = synthetic kinematics (general) or the simulator (paper)
@@ -209,11 +209,13 @@ class TrainConfig:
     threads           of torch; None = as many as there are cores
     network, windows  of the general preset
     paper             of the paper preset
-    scene             of the scene preset
+    place             of the place preset; its older name, scene, is still read
     rival             of the rivals
     """
 
-    preset: Literal["general", "paper", "scene", "vrnn", "grammi_without_mi", "grammi"] = "general"
+    preset: Literal["general", "paper", "place", "vrnn", "grammi_without_mi", "grammi"] = field(
+        default="general", metadata={"older_values": {"scene": "place"}}
+    )
     data: Path | None = None
     extract: ExtractConfig = field(default_factory=ExtractConfig)
     seed: int = 0
@@ -227,7 +229,7 @@ class TrainConfig:
     windows: SyntheticConfig = field(default_factory=SyntheticConfig)
     optimiser: OptimiserConfig = field(default_factory=OptimiserConfig)
     paper: AbsoluteTraining = field(default_factory=AbsoluteTraining)
-    scene: SceneTraining = field(default_factory=SceneTraining)
+    place: PlaceTraining = field(default_factory=PlaceTraining, metadata={"older_name": "scene"})
     rival: RivalTraining = field(default_factory=RivalTraining)
 
     def __post_init__(self) -> None:

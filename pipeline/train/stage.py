@@ -11,8 +11,8 @@ from pipeline.progress import Progress
 from pipeline.train.config import TrainConfig
 from pipeline.train.general import train_general
 from pipeline.train.paper import train_absolute
+from pipeline.train.place import train_place
 from pipeline.train.rivals import train_rivals
-from pipeline.train.scene import train_scene
 
 
 def train(out: Path, config: TrainConfig, progress: Progress, force: bool = False) -> StageResult:
@@ -28,7 +28,7 @@ def train(out: Path, config: TrainConfig, progress: Progress, force: bool = Fals
 TRAININGS: Mapping[str, Callable[[Path, TrainConfig, Progress, bool], StageResult]] = {
     "general": train_general,
     "paper": train_absolute,
-    "scene": train_scene,
+    "place": train_place,
     **dict.fromkeys(RIVALS, train_rivals),
 }
 """How a checkpoint of each preset is made."""

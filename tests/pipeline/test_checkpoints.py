@@ -59,6 +59,11 @@ def test_round_trip(tmp_path: Path) -> None:
     assert find_checkpoint(str(path)) == path
 
 
+def test_a_checkpoint_of_0_3_calls_the_place_preset_scene(saved: Path) -> None:
+    edit(saved, preset="scene")
+    assert read_info(saved).preset == "place"
+
+
 def test_the_hash_tells_weights_and_description(saved: Path) -> None:
     first = checkpoint_hash(saved)
     assert first == checkpoint_hash(saved) and len(first) == 32

@@ -6,6 +6,7 @@ from typing import Literal
 
 import pytest
 
+from cadence.diffusion.place import PlaceSampling
 from cadence.errors import ConfigError
 from pipeline.config import (
     config_as_dict,
@@ -16,6 +17,9 @@ from pipeline.config import (
     read_config,
     read_settings,
 )
+from pipeline.forecast.stage import ForecastConfig
+from pipeline.infer.config import InferConfig
+from pipeline.train.config import TrainConfig
 
 
 @dataclass(frozen=True)
@@ -175,3 +179,26 @@ def test_numbers_at_the_limits_seeds_and_no_limit_at_all_are_settings():
     assert config.count == 10**9 and config.inner.ratio == float("inf") and config.sizes_m == (1e-9, 0.0)
     with pytest.raises(ConfigError, match="unknown key 'seed'"):  # its size was no reason to refuse it
         read_settings(Outer, {"seed": 2**63 - 1}, "")
+
+
+@dataclass(frozen=True)
+class Renamed:
+    kind: Literal["place", "bank"] = field(default="bank", metadata={"older_values": {"scene": "place"}})
+    inner: Inner = field(default=Inner(), metadata={"older_name": "outer"})
+
+
+def test_what_was_called_otherwise_is_still_read():
+    table = {"kind": "scene", "outer": {"ratio": 2.0}}
+    assert read_config(Renamed, table) == Renamed("place", Inner(ratio=2.0))
+    assert table == {"kind": "scene", "outer": {"ratio": 2.0}}
+    with pytest.raises(ConfigError, match=r"config: 'outer' is the older name of 'inner'; give one of the two"):
+        read_config(Renamed, {"inner": {}, "outer": {}})
+    with pytest.raises(ConfigError, match=r"config\.kind: 'scenes' is not one of place, bank"):
+        read_config(Renamed, {"kind": "scenes"})
+
+
+def test_tables_of_0_3_are_read():
+    assert read_config(InferConfig, {"scene": {"num_steps": 3}}) == InferConfig(place=PlaceSampling(num_steps=3))
+    assert read_config(ForecastConfig, {"scene": {"num_steps": 3}}).place == PlaceSampling(num_steps=3)
+    train = read_config(TrainConfig, {"preset": "scene", "scene": {"few_steps": 3}})
+    assert (train.preset, train.place.few_steps) == ("place", 3)

@@ -22,7 +22,7 @@ def points(*rows, dtype=torch.float64):
     return torch.tensor(rows, dtype=dtype)
 
 
-def scene(seed, num_circles=3, num_polygons=3):
+def some_obstacles(seed, num_circles=3, num_polygons=3):
     """Circles and star-shaped (mostly concave) polygons, some overlapping, in a square of 100."""
     g = torch.Generator().manual_seed(seed)
 
@@ -75,14 +75,14 @@ def test_everything_is_finite_at_the_singular_points():
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_shape_and_type_follow_the_positions(dtype):
-    distance, gradient = scene(1).signed_distance(torch.rand(2, 3, 4, 2, dtype=dtype) * 100)
+    distance, gradient = some_obstacles(1).signed_distance(torch.rand(2, 3, 4, 2, dtype=dtype) * 100)
     assert distance.shape == (2, 3, 4) and gradient.shape == (2, 3, 4, 2)
     assert distance.dtype == gradient.dtype == dtype
 
 
 @pytest.mark.parametrize("seed", range(5))
 def test_gradient_is_that_of_the_distance(seed):
-    obstacles, step = scene(seed), 1e-6
+    obstacles, step = some_obstacles(seed), 1e-6
     position = torch.rand(300, 2, generator=torch.Generator().manual_seed(seed), dtype=torch.float64) * 120 - 10
     _, gradient = obstacles.signed_distance(position)
     ahead = [obstacles.signed_distance(position + step * points(axis))[0] for axis in ([1, 0], [0, 1])]
@@ -95,7 +95,7 @@ def test_gradient_is_that_of_the_distance(seed):
 
 
 def test_offset_and_limit():
-    obstacles, position = scene(2), torch.rand(50, 2, dtype=torch.float64) * 100
+    obstacles, position = some_obstacles(2), torch.rand(50, 2, dtype=torch.float64) * 100
     offset = points([40, -30])
     full, slope = obstacles.signed_distance(position)
     shifted, _ = obstacles.signed_distance(position - offset, offset_m=offset)
@@ -106,14 +106,14 @@ def test_offset_and_limit():
 
 
 def test_nan_and_no_obstacles():
-    distance, gradient = scene(0).signed_distance(points([math.nan, 1.0]), limit_m=3.0)
+    distance, gradient = some_obstacles(0).signed_distance(points([math.nan, 1.0]), limit_m=3.0)
     assert distance.tolist() == [3.0] and gradient.tolist() == [[0.0, 0.0]]
     distance, gradient = Obstacles.none().signed_distance(points([1.0, 1.0]))
     assert distance.tolist() == [math.inf] and gradient.tolist() == [[0.0, 0.0]]
 
 
 def test_translation_changes_nothing():
-    obstacles, position = scene(4), torch.rand(100, 2, dtype=torch.float64) * 100
+    obstacles, position = some_obstacles(4), torch.rand(100, 2, dtype=torch.float64) * 100
     far = points([4e5, -3e5])
     moved = Obstacles(obstacles.circles + torch.cat([far[0], torch.zeros(1)]), tuple((r + far,) for (r,) in obstacles.polygons))
     torch.testing.assert_close(moved.signed_distance(position + far), obstacles.signed_distance(position), atol=1e-6, rtol=0)
@@ -138,7 +138,7 @@ def test_meaningless_obstacles_are_refused(bad):
 
 
 def test_constraint_gradient_is_that_of_its_cost():
-    constraint = ObstacleConstraint(scene(3), margin_m=4.0)
+    constraint = ObstacleConstraint(some_obstacles(3), margin_m=4.0)
     position = (torch.rand(2, 40, 2, generator=torch.Generator().manual_seed(3), dtype=torch.float64) * 100).requires_grad_()
     constraint.cost(position).sum().backward()
     torch.testing.assert_close(position.grad, constraint.gradient(position))
@@ -175,7 +175,7 @@ def test_checker_by_hand():
 
 
 def test_checker_edge_cases():
-    obstacles = scene(0)
+    obstacles = some_obstacles(0)
     assert segments_in_collision(torch.zeros(2, 1, 2), obstacles).shape == (2, 0)
     assert not segments_in_collision(torch.full((2, 5, 2), math.nan), obstacles).any()
     assert not states_in_collision(torch.full((2, 5, 2), math.nan), obstacles).any()
@@ -188,7 +188,7 @@ def test_checker_edge_cases():
 
 @given(seed=st.integers(0, 10_000))
 def test_checker_agrees_with_dense_sampling(seed):
-    obstacles = scene(seed)
+    obstacles = some_obstacles(seed)
     g = torch.Generator().manual_seed(seed)
     track = torch.rand(6, 5, 2, generator=g, dtype=torch.float64) * 120 - 10
     offset = torch.rand(6, 1, 2, generator=g, dtype=torch.float64) * 10
@@ -206,7 +206,7 @@ def test_checker_agrees_with_dense_sampling(seed):
 
 def test_checker_is_fast():
     """1000 hypotheses × 96 steps × 20 obstacles: measured 0.02 s; the bound is for busy machines."""
-    obstacles = scene(7, 10, 10)
+    obstacles = some_obstacles(7, 10, 10)
     track = torch.cumsum(torch.randn(1000, 96, 2, generator=torch.Generator().manual_seed(0)), dim=1) + 50
     segments_in_collision(track[:2], obstacles)
     start = time.process_time()

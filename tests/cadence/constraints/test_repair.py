@@ -183,7 +183,7 @@ def test_placement_hits_corners_and_keeps_the_rhythm():
     assert place(old[:3], path, arc_length(path)[1:-1], arc_length(path)[-1]) is None
 
 
-def random_scene(seed):
+def random_obstacles(seed):
     """Up to ten circles, stars, bays and rooms close to each other, and 8 wandering tracks with some steps pinned."""
     g = torch.Generator().manual_seed(seed)
 
@@ -208,7 +208,7 @@ def random_scene(seed):
 
 @given(seed=st.integers(0, 1_000_000), margin=st.sampled_from([0.0, 5.0, 25.0]), is_single=st.booleans())
 def test_no_feasible_hypothesis_collides(seed, margin, is_single):
-    obstacles, track, pinned = random_scene(seed)
+    obstacles, track, pinned = random_obstacles(seed)
     track = track.float() if is_single else track
     moved, feasible = repair(track, obstacles, pinned, margin)
     assert torch.isfinite(moved).all()
@@ -224,7 +224,7 @@ def test_nearly_every_repairable_hypothesis_is_repaired():
     """Without pinned steps there is always a way; with some it fails only where walls or time forbid it."""
     repairable = repaired = 0
     for seed in range(40):
-        obstacles, track, pinned = random_scene(seed)
+        obstacles, track, pinned = random_obstacles(seed)
         _, feasible = repair(track, obstacles, torch.zeros_like(pinned), 5.0)
         assert feasible.all()
         _, feasible = repair(track, obstacles, pinned, 5.0)

@@ -9,7 +9,7 @@ from test_general import network
 from cadence.bank.bank import Bank
 from cadence.constraints.checker import segments_in_collision, states_in_collision
 from cadence.constraints.obstacles import Obstacles
-from cadence.diffusion.feasible import Feasibility, GuidanceConfig, Place, resampled
+from cadence.diffusion.feasible import Feasibility, GuidanceConfig, KeepOut, resampled
 from cadence.diffusion.general import GeneralModel
 from cadence.types import Context, Detections, WindowBatch
 
@@ -44,9 +44,9 @@ def in_the_way() -> Obstacles:
 
 
 OBSTACLES = in_the_way()
-PLACE = Place(OBSTACLES, 0.0, DATUM[:, None, None])
-LIMITS = Feasibility(PLACE, 1.0)
-NO_LIMITS = Feasibility(dataclasses.replace(PLACE, obstacles=Obstacles.none()), 1.0)
+KEEP_OUT = KeepOut(OBSTACLES, 0.0, DATUM[:, None, None])
+LIMITS = Feasibility(KEEP_OUT, 1.0)
+NO_LIMITS = Feasibility(dataclasses.replace(KEEP_OUT, obstacles=Obstacles.none()), 1.0)
 
 
 def sampled(limits: Feasibility | None = None) -> torch.Tensor:
@@ -114,7 +114,7 @@ def test_a_speed_limit_slows_down() -> None:
 
 
 def test_margin_is_kept() -> None:
-    wide = Feasibility(dataclasses.replace(PLACE, margin_m=0.4), 1.0)
+    wide = Feasibility(dataclasses.replace(KEEP_OUT, margin_m=0.4), 1.0)
     moved, _, is_feasible = wide.finish(sampled(), POSTERIOR.sigma_m, LENGTH_M)
     assert is_feasible.all()
     distance, _ = OBSTACLES.signed_distance(moved, offset_m=DATUM[:, None, None])
@@ -124,11 +124,11 @@ def test_margin_is_kept() -> None:
 def test_what_was_moved_far_counts_less_and_what_cannot_be_repaired_least() -> None:
     still = POSTERIOR.mean_m[:1, None].expand(1, 3, -1, -1).clone()
     still[0, :2] += torch.tensor([0.0, 40.0])  # two clear of everything, one through the circle
-    limits = Feasibility(dataclasses.replace(PLACE, offset_m=DATUM[:1, None, None]), 1.0)
+    limits = Feasibility(dataclasses.replace(KEEP_OUT, offset_m=DATUM[:1, None, None]), 1.0)
     _, weight, is_feasible = limits.finish(still, POSTERIOR.sigma_m[:1].clamp_min(0.5), LENGTH_M)
     assert is_feasible.all() and weight[0, 0] == weight[0, 1] > weight[0, 2] > 0
     buried = Obstacles(torch.tensor([[1000.0 + float(TIMES[1]), -500.0 + 0.05 * float(TIMES[1]) ** 2, 0.7]]).double())
-    limits = Feasibility(dataclasses.replace(limits.place, obstacles=buried), 1.0)
+    limits = Feasibility(dataclasses.replace(limits.keep_out, obstacles=buried), 1.0)
     _, weight, is_feasible = limits.finish(still, POSTERIOR.sigma_m[:1], LENGTH_M)
     assert is_feasible.tolist() == [[True, True, False]]
     assert weight[0, 2] == pytest.approx(1e-3 * float(weight[0, 0]))

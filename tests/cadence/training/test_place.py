@@ -5,12 +5,12 @@ import pytest
 import torch
 
 from cadence.metrics import energy_score
-from cadence.network.scene import SceneNetworkConfig
+from cadence.network.place import PlaceNetworkConfig
 from cadence.recordings import Recordings, cut_windows
 from cadence.training.loop import OptimiserConfig
 from cadence.training.place import place_config, train_place
 
-SMALL = SceneNetworkConfig(width=8, multipliers=(1, 2), encoder_size=8, map_channels=0)
+SMALL = PlaceNetworkConfig(width=8, multipliers=(1, 2), encoder_size=8, map_channels=0)
 
 
 def crossings(num: int = 12, seed: int = 0) -> Recordings:

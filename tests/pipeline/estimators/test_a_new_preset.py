@@ -81,7 +81,7 @@ def test_a_device_on_which_the_preset_does_not_run_is_refused(weights: Path) -> 
 def test_a_preset_serves_the_stages_that_it_says(weights: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     only = {**presets.PRESETS, "parked": Preset(load_parked, infers=False)}
     monkeypatch.setattr(presets, "PRESETS", only)
-    with pytest.raises(ConfigError, match=r"'parked', which does not draw hypotheses .* one of general, scene, paper$"):
+    with pytest.raises(ConfigError, match=r"'parked', which does not draw hypotheses .* one of general, place, paper$"):
         load_estimator(str(weights), Samplings())
-    with pytest.raises(ConfigError, match="'general', which does not forecast; give one of scene, paper, vrnn"):
+    with pytest.raises(ConfigError, match="'general', which does not forecast; give one of place, paper, vrnn"):
         load_forecaster("general")

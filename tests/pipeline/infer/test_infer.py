@@ -12,7 +12,7 @@ import torch
 
 from cadence.constraints.checker import segments_in_collision, states_in_collision
 from cadence.diffusion.feasible import GuidanceConfig
-from cadence.diffusion.scene import SceneSampling
+from cadence.diffusion.place import PlaceSampling
 from cadence.errors import CadenceError, ConfigError, DeviceError, InputError
 from cadence.network.residual import ResidualNetwork, ResidualNetworkConfig
 from pipeline.checkpoints import CheckpointInfo, checkpoint_hash, save_checkpoint
@@ -300,7 +300,7 @@ def test_settings_that_the_preset_does_not_read_are_refused(tmp_path: Path) -> N
         ({"checkpoint": "prison", "num_steps": 6}, "infer.num_steps"),
         ({"checkpoint": "prison", "grid": GridConfig(step_s=5.0)}, "infer.grid.step_s"),
         ({"checkpoint": "none", "sampler": "ddim"}, "infer.sampler"),
-        ({"checkpoint": "none", "scene": SceneSampling(num_steps=3)}, "infer.scene.num_steps"),
+        ({"checkpoint": "none", "place": PlaceSampling(num_steps=3)}, "infer.place.num_steps"),
     ):
         config = dataclasses.replace(InferConfig(), **changes)
         with pytest.raises(ConfigError, match=f"^{setting}: .* does not read it.* Read are: ") as caught:

@@ -261,16 +261,16 @@ def test_side_file_and_page_tell_of_agents_and_sources(tmp_path: Path, monkeypat
 
 
 def slow(table: pa.Table) -> pa.Table:
-    """The same with a minute for every second: the paper's and the scene preset's steps are minutes."""
+    """The same with a minute for every second: the paper's and the place preset's steps are minutes."""
     time_ns = (table["time_ns"].to_numpy() - START_NS) * 60 + START_NS
     return table.set_column(table.schema.get_field_index("time_ns"), table.schema.field("time_ns"), pa.array(time_ns))
 
 
 @pytest.mark.usefixtures("stand_in")
-@pytest.mark.parametrize("preset", ["paper", "scene"])
+@pytest.mark.parametrize("preset", ["paper", "place"])
 def test_presets_that_know_a_place_draw_every_way(tmp_path: Path, preset: str) -> None:
     directory = mission(tmp_path, slow(detections()))
-    weights = "prison" if preset == "scene" else str(checkpoint(tmp_path / "small.safetensors"))
+    weights = "prison" if preset == "place" else str(checkpoint(tmp_path / "small.safetensors"))
     config = InferConfig(num_hypotheses=8, checkpoint=weights, device="cpu", grid=GridConfig(stride_steps=32))
     if preset == "paper":
         config = dataclasses.replace(config, paper=AbsoluteSampling(sampler="dpmpp", num_steps=2))

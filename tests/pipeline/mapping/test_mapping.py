@@ -210,6 +210,7 @@ def test_no_known_type_and_no_paths() -> None:
 
 
 def test_the_older_name_of_a_message_type_is_still_read() -> None:
-    assert SourceConfig("/fix", preset="NavSatFix") == SourceConfig("/fix", message_type="NavSatFix")
-    with pytest.raises(ValueError, match="older name of message_type"):
-        SourceConfig("/fix", preset="NavSatFix", message_type="NavSatFix")
+    older = {"topic": "/fix", "preset": "NavSatFix"}
+    assert read_config(SourceConfig, older) == SourceConfig("/fix", message_type="NavSatFix")
+    with pytest.raises(ConfigError, match="'preset' is the older name of 'message_type'; give one of the two"):
+        read_config(SourceConfig, older | {"message_type": "NavSatFix"})

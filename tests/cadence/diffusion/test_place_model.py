@@ -1,4 +1,4 @@
-"""The scene model: how tracks are stated, what the network is told, sampling, and its two losses."""
+"""The place model: how tracks are stated, what the network is told, sampling, and its two losses."""
 
 import dataclasses
 from typing import Any
@@ -10,19 +10,19 @@ import torch
 from cadence import metrics
 from cadence.constraints.checker import segments_in_collision, states_in_collision
 from cadence.constraints.obstacles import Obstacles
-from cadence.diffusion.scene import SceneModel, SceneSampling
-from cadence.diffusion.scene_frame import SceneConfig, future_of, recorded_track, scene_inputs, to_pieces, to_track
+from cadence.diffusion.place import PlaceModel, PlaceSampling
+from cadence.diffusion.place_frame import PlaceConfig, future_of, place_inputs, recorded_track, to_pieces, to_track
 from cadence.errors import ConfigError
-from cadence.network.scene import SceneNetworkConfig
+from cadence.network.place import PlaceNetworkConfig
 from cadence.recordings import ForecastWindows, Recordings, cut_windows
-from cadence.training import scene as training
-from cadence.training.scene import Dropout, SceneWindows, diffusion_loss, energy_loss, few_step_sample, scene_windows
+from cadence.training import place_losses as training
+from cadence.training.place_losses import Dropout, PlaceWindows, diffusion_loss, energy_loss, few_step_sample, place_windows
 from cadence.types import Context
 
-SMALL = SceneNetworkConfig(
+SMALL = PlaceNetworkConfig(
     width=16, multipliers=(1, 2), encoder_size=8, code_size=16, level_size=8, max_detections=12, map_cells=8, map_channels=2
 )
-CONFIG = SceneConfig(SMALL, centre_m=(5000.0, 5000.0), scale_m=5000.0, unit_step_m=60.0, max_step_m=100.0, stride=4)
+CONFIG = PlaceConfig(SMALL, centre_m=(5000.0, 5000.0), scale_m=5000.0, unit_step_m=60.0, max_step_m=100.0, stride=4)
 
 
 def recordings(num: int = 6, seed: int = 0) -> Recordings:
@@ -50,16 +50,16 @@ def windows(num: int = 8) -> ForecastWindows:
     return cut_windows(rec, episode, (rng.random(num) * rec.length[episode]).astype(np.int64))
 
 
-def model(sampling: SceneSampling | None = None, config: SceneConfig = CONFIG, std: float = 0.3) -> SceneModel:
+def model(sampling: PlaceSampling | None = None, config: PlaceConfig = CONFIG, std: float = 0.3) -> PlaceModel:
     torch.manual_seed(0)
     network = config.build()
     torch.nn.init.normal_(network.unet.head.weight, std=std)
-    return SceneModel(network.eval(), config, sampling or SceneSampling(num_steps=3))
+    return PlaceModel(network.eval(), config, sampling or PlaceSampling(num_steps=3))
 
 
 def test_a_track_is_the_sum_of_its_pieces() -> None:
     cut, rec = windows(), recordings()
-    inputs = scene_inputs(cut.windows, CONFIG)
+    inputs = place_inputs(cut.windows, CONFIG)
     rows = rec.offset[cut.episode.numpy()] + cut.step.numpy()
     track = recorded_track(rec, rows, cut.episode.numpy(), inputs.pieces)
     pieces = to_pieces(track, inputs.pieces, CONFIG)
@@ -72,10 +72,10 @@ def test_a_track_is_the_sum_of_its_pieces() -> None:
 
 def test_inputs_do_not_depend_on_padding_or_neighbours() -> None:
     cut = windows()
-    together = scene_inputs(cut.windows, CONFIG)
+    together = place_inputs(cut.windows, CONFIG)
     for row in range(len(cut)):
         one = cut[row : row + 1]
-        alone = scene_inputs(one.windows, CONFIG)
+        alone = place_inputs(one.windows, CONFIG)
         assert torch.equal(alone.summary, together.summary[row : row + 1])
         count = int(alone.is_observed.sum())
         assert torch.equal(alone.rows[0, :count], together.rows[row, :count])
@@ -86,7 +86,7 @@ def test_all_detections_are_read_where_they_fit_and_otherwise_the_last_ones_and_
     rec = recordings()
     rec.is_detected[:] = True
     cut = cut_windows(rec, np.array([2, 2]), np.array([6, 25]))
-    inputs = scene_inputs(cut.windows, CONFIG)
+    inputs = place_inputs(cut.windows, CONFIG)
     ages = (inputs.rows[..., 1] * 200.0).round()
     assert ages[0, :7].tolist() == list(range(6, -1, -1)) and int(inputs.is_observed[0].sum()) == 7
     assert ages[1, 0] == 25 and ages[1, -8:].tolist() == list(range(7, -1, -1)) and bool(inputs.is_observed[1].all())
@@ -99,7 +99,7 @@ def test_trackers_are_a_set_and_a_goal_that_is_not_told_is_none() -> None:
     assert context.tracker_m is not None and context.known_goal_m is not None
 
     def code(**changes: object) -> torch.Tensor:
-        return network.encode(scene_inputs(cut.windows.with_context(dataclasses.replace(context, **changes)), CONFIG)).detach()
+        return network.encode(place_inputs(cut.windows.with_context(dataclasses.replace(context, **changes)), CONFIG)).detach()
 
     assert torch.allclose(code(), code(tracker_m=context.tracker_m[:, :, [2, 0, 1]]), atol=1e-5)
     assert not torch.allclose(code(), code(tracker_m=context.tracker_m + 500.0), atol=1e-3)
@@ -125,7 +125,7 @@ def test_places_are_told_as_they_should_be_and_a_network_may_do_without_a_map() 
         config = dataclasses.replace(CONFIG, network=small)
         found = model(config=config)
         tracks[places] = [found.sample(c.windows, 2).position_m for c in (cut, moved(cut, 800.0))]
-        inputs = scene_inputs(cut.windows, config)
+        inputs = place_inputs(cut.windows, config)
         is_offset, is_place = (bool(inputs.rows[..., columns].any()) for columns in (slice(4, 6), slice(2, 4)))
         assert (is_offset, is_place) == (places != "absolute", places != "relative")
     assert torch.allclose(*tracks["relative"], atol=0.5)  # without a map it does not know where it is
@@ -139,7 +139,7 @@ def test_places_are_told_as_they_should_be_and_a_network_may_do_without_a_map() 
 def test_hypotheses_belong_to_their_window(sampler: str) -> None:
     cut = windows()
     config = dataclasses.replace(CONFIG, few_steps=2 if sampler == "few" else 0)
-    found = model(SceneSampling(sampler=sampler, num_steps=3), config)  # type: ignore[arg-type]
+    found = model(PlaceSampling(sampler=sampler, num_steps=3), config)  # type: ignore[arg-type]
     together = found.sample(cut.windows, 3).position_m
     assert together.shape == (8, 3, 1, 120, 2) and bool(together.isfinite().all())
     pick = torch.tensor([5, 2])
@@ -170,14 +170,14 @@ def test_guidance_and_repair_keep_out_of_obstacles(guidance: str) -> None:
     cut = cut[torch.nonzero((cut.context.datum_m[:, None] - circles[:, :2]).norm(dim=-1).min(dim=1).values > 750.0)[:, 0]]
     shares = {}
     for is_repaired in (False, True):
-        sampling = SceneSampling(sampler="ddpm", num_steps=10, guidance=guidance, is_repaired=is_repaired)  # type: ignore[arg-type]
+        sampling = PlaceSampling(sampler="ddpm", num_steps=10, guidance=guidance, is_repaired=is_repaired)  # type: ignore[arg-type]
         walled = cut.with_context(dataclasses.replace(cut.context, obstacles=walls))
         found = model(sampling, std=0.05).sample(walled.windows, 4).position_m
         offset = cut.context.datum_m[:, None, None, None]
         hit = states_in_collision(found, walls, offset_m=offset)
         crossing = segments_in_collision(found, walls, offset_m=offset)
         shares[is_repaired] = (float(hit.double().mean()), float(crossing.double().mean()))
-    free = model(SceneSampling(sampler="ddpm", num_steps=10), std=0.05).sample(cut.windows, 4).position_m
+    free = model(PlaceSampling(sampler="ddpm", num_steps=10), std=0.05).sample(cut.windows, 4).position_m
     unguided = float(states_in_collision(free, walls, offset_m=cut.context.datum_m[:, None, None, None]).double().mean())
     assert unguided > 0.01
     if guidance in ("final", "clean"):
@@ -187,10 +187,10 @@ def test_guidance_and_repair_keep_out_of_obstacles(guidance: str) -> None:
 
 def test_reading_the_detections_again_and_rounding_change_little() -> None:
     cut = windows()
-    plain = model(SceneSampling(num_steps=3)).sample(cut.windows, 3).position_m
-    again = model(SceneSampling(num_steps=3, encode_each_step=True)).sample(cut.windows, 3).position_m
+    plain = model(PlaceSampling(num_steps=3)).sample(cut.windows, 3).position_m
+    again = model(PlaceSampling(num_steps=3, encode_each_step=True)).sample(cut.windows, 3).position_m
     assert torch.allclose(plain, again, atol=0.5)
-    rounded = model(SceneSampling(num_steps=3, precision="bfloat16")).sample(cut.windows, 3).position_m
+    rounded = model(PlaceSampling(num_steps=3, precision="bfloat16")).sample(cut.windows, 3).position_m
     difference = (rounded - plain).norm(dim=-1)
     assert 0.0 < float(difference.mean()) < 0.2 * CONFIG.unit_step_m
 
@@ -200,37 +200,37 @@ def test_refusals_name_what_to_do() -> None:
     with pytest.raises(ConfigError, match="step_s = 60"):
         model().sample(dataclasses.replace(cut.windows, time_s=cut.windows.time_s * 2).with_context(cut.context), 2)
     with pytest.raises(ConfigError, match="not tuned"):
-        model(SceneSampling(sampler="few")).sample(cut.windows, 2)
+        model(PlaceSampling(sampler="few")).sample(cut.windows, 2)
     with pytest.raises(ConfigError, match=r"'ddim', but .* 2 steps"):
         tuned = dataclasses.replace(CONFIG, few_steps=2)
-        model(SceneSampling(sampler="ddim"), tuned).sample(cut.windows, 2)
+        model(PlaceSampling(sampler="ddim"), tuned).sample(cut.windows, 2)
     with pytest.raises(ValueError, match="where they are"):
         model().sample(cut.windows.with_context(None), 2)
     with pytest.raises(ValueError, match="ddpm"):
-        SceneSampling(sampler="ddim", guidance="paper")
+        PlaceSampling(sampler="ddim", guidance="paper")
     with pytest.raises(ValueError, match="reach"):
-        SceneConfig(num_future=16)
+        PlaceConfig(num_future=16)
 
 
-def training_windows(num: int = 16) -> SceneWindows:
+def training_windows(num: int = 16) -> PlaceWindows:
     rec, rng = recordings(), np.random.default_rng(2)
-    return scene_windows(rec, rng.integers(0, len(rec.position_m), num), CONFIG, Dropout(), rng)
+    return place_windows(rec, rng.integers(0, len(rec.position_m), num), CONFIG, Dropout(), rng)
 
 
 def test_what_is_told_follows_the_shares() -> None:
     rec, rng = recordings(), np.random.default_rng(3)
     rows = rng.integers(0, len(rec.position_m), 400)
-    found = scene_windows(rec, rows, CONFIG, Dropout(1.0, 0.25, 0.5), rng)
+    found = place_windows(rec, rows, CONFIG, Dropout(1.0, 0.25, 0.5), rng)
     assert len(found) == 400
     assert abs(float((found.inputs.is_tracker.sum(dim=1) > 0).float().mean()) - 0.5) < 0.1
-    assert len(scene_windows(rec, rows, CONFIG, Dropout(0.0, 0.0, 0.0), rng)) < 400  # before the first detection
+    assert len(place_windows(rec, rows, CONFIG, Dropout(0.0, 0.0, 0.0), rng)) < 400  # before the first detection
 
 
 def test_of_a_source_there_may_be_no_window_at_all() -> None:
     rec = recordings()
     unseen = dataclasses.replace(rec, is_detected=np.zeros_like(rec.is_detected))
     rng = np.random.default_rng(0)
-    found = scene_windows(unseen, np.array([30, 50]), CONFIG, Dropout(known_start=0.0), rng)
+    found = place_windows(unseen, np.array([30, 50]), CONFIG, Dropout(known_start=0.0), rng)
     assert len(found) == 0 and found.clean.shape == (0, CONFIG.num_pieces, 2)
 
 
@@ -265,11 +265,11 @@ def test_the_energy_score_is_the_unbiased_one() -> None:
 
 def test_the_few_steps_of_training_are_those_of_sampling() -> None:
     cut, config = windows(), dataclasses.replace(CONFIG, few_steps=2)
-    plain = SceneSampling(guidance="none", is_antithetic=False)
+    plain = PlaceSampling(guidance="none", is_antithetic=False)
     free = dataclasses.replace(model(config=config), sampling=plain)
     free = dataclasses.replace(free, config=dataclasses.replace(config, max_step_m=1e9))
     drawn = free.sample(cut.windows, 2).position_m[:, :, 0]
-    inputs = scene_inputs(cut.windows, config)
+    inputs = place_inputs(cut.windows, config)
     noise = torch.stack([torch.randn(2, 40, 2, generator=torch.Generator().manual_seed(int(s))) for s in cut.windows.seeds])
     with torch.no_grad():
         code = free.network.encode(inputs).repeat_interleave(2, dim=0)
@@ -282,14 +282,14 @@ def test_every_second_hypothesis_begins_with_mirrored_noise() -> None:
     """A network that answers nothing leaves the noise as it is, but for its length."""
     cut = windows()
     for sampler, is_mirrored in (("dpmpp", True), ("ddim", True), ("ddpm", False)):
-        silent = model(SceneSampling(sampler=sampler, num_steps=3), std=0.0)  # type: ignore[arg-type]
+        silent = model(PlaceSampling(sampler=sampler, num_steps=3), std=0.0)  # type: ignore[arg-type]
         tracks = silent.sample(cut.windows, 5).position_m[:, :, 0]
         middle = 0.5 * (tracks[:, 0:4:2] + tracks[:, 1:4:2])[:, :, :40]
         spread = (tracks[:, 0:4:2] - tracks[:, 1:4:2])[:, :, :40]
         assert tracks.shape[1] == 5 and bool((spread.norm(dim=-1) > 0.1).any())
         same = middle[:, :1].expand_as(middle)  # where the last detection and nothing else leads
         assert torch.allclose(middle, same, atol=0.5) == is_mirrored, sampler
-    alone = model(SceneSampling(num_steps=3, is_antithetic=False), std=0.0)
+    alone = model(PlaceSampling(num_steps=3, is_antithetic=False), std=0.0)
     tracks = alone.sample(cut.windows, 4).position_m[:, :, 0]
     assert not torch.allclose(tracks[:, 0] + tracks[:, 1], tracks[:, 2] + tracks[:, 3], atol=20.0)
 
@@ -310,7 +310,7 @@ def test_contexts_are_checked() -> None:
         ({"num_gap": 7}, "multiple of 2"),
     ],
 )
-def test_settings_of_the_scene_that_cannot_be(changes: dict[str, float], says: str) -> None:
+def test_settings_of_sampling_that_cannot_be(changes: dict[str, float], says: str) -> None:
     with pytest.raises(ValueError, match=says):
         dataclasses.replace(CONFIG, **changes)
 
@@ -325,4 +325,4 @@ def test_settings_of_the_scene_that_cannot_be(changes: dict[str, float], says: s
 )
 def test_settings_of_the_sampling_that_cannot_be(settings: dict[str, Any], says: str) -> None:
     with pytest.raises(ValueError, match=says):
-        SceneSampling(**settings)
+        PlaceSampling(**settings)

@@ -1,4 +1,4 @@
-"""The scene model as an estimator: where a target goes in a place whose ways the network has learned.
+"""The place model as an estimator: where a target goes in a place whose ways the network has learned.
 
 Like the paper's model (Ye et al., CADENCE, MRS 2023) it predicts from now on; unlike it, tracks are displacements that begin at
 the last detection, so that detections need no inpainting, and the stretch since then is part of every hypothesis.
@@ -14,16 +14,16 @@ from torch import Tensor
 from cadence.bank.rows import scatter_hypotheses
 from cadence.constraints.obstacles import ObstacleConstraint
 from cadence.constraints.speed import exceeds
-from cadence.diffusion.feasible import Place, redrawn, within_limits
+from cadence.diffusion.feasible import KeepOut, redrawn, within_limits
 from cadence.diffusion.guidance import PaperCost, adam_guidance, clean_estimate_guidance
 from cadence.diffusion.noise import RowNoise
+from cadence.diffusion.place_frame import PlaceConfig, future_of, place_inputs, to_pieces, to_track
+from cadence.diffusion.place_team import agent_rows, shared_detections
 from cadence.diffusion.sampler import even_angles, even_log_snr, sample_ddim, sample_ddpm, sample_dpmpp_2m
-from cadence.diffusion.scene_frame import SceneConfig, future_of, scene_inputs, to_pieces, to_track
-from cadence.diffusion.scene_team import agent_rows, shared_detections
 from cadence.errors import ConfigError
 from cadence.network.attention import MAX_AGENTS, Team
-from cadence.network.frozen import FrozenScene
-from cadence.network.scene import Pieces, SceneNetwork
+from cadence.network.frozen import FrozenPlace
+from cadence.network.place import Pieces, PlaceNetwork
 from cadence.recordings import NUM_STEPS
 from cadence.schedule import MAX_ANGLE, clean_from, cosine_schedule
 from cadence.types import Context, Detections, HypothesisSet, WindowBatch
@@ -38,8 +38,8 @@ straight line between two knots on an edge cuts through the obstacle, and what i
 
 
 @dataclass(frozen=True)
-class SceneSampling:
-    """How a scene model is sampled.
+class PlaceSampling:
+    """How a place model is sampled.
 
     sampler     "few": the few steps that the weights were tuned for, which take no other; "ddpm", "ddim", "dpmpp": any number
                 for weights that were trained by diffusion alone; "auto": few where the weights are tuned, else dpmpp
@@ -79,16 +79,16 @@ class SceneSampling:
 
 
 @dataclass(frozen=True, eq=False)
-class SceneModel:
+class PlaceModel:
     """A trained network as an `Estimator` for windows that begin now and say where they are (`WindowBatch.context`).
 
     Networks with attention draw all agents of a window together, others each agent for itself; agents without detections are
     NaN.
     """
 
-    network: SceneNetwork
-    config: SceneConfig
-    sampling: SceneSampling = field(default_factory=SceneSampling)
+    network: PlaceNetwork
+    config: PlaceConfig
+    sampling: PlaceSampling = field(default_factory=PlaceSampling)
     name: str = "cadence"
 
     @property
@@ -107,7 +107,7 @@ class SceneModel:
         if self.config.shared_gap_steps:
             windows = shared_detections(windows)
         rows = agent_rows(windows, self.config)
-        network = FrozenScene(self.network, getattr(torch, self.sampling.precision))
+        network = FrozenPlace(self.network, getattr(torch, self.sampling.precision))
         size = rows.team.num_agents if rows.team is not None else 1  # rows that belong together
         per_chunk = size * max(1, self.sampling.chunk // (num_hypotheses * size))
         parts = [torch.zeros(0, num_hypotheses, NUM_STEPS, 2, dtype=torch.float64)]
@@ -126,19 +126,19 @@ class SceneModel:
             )
         sampler, tuned = self.sampling.sampler, self.config.few_steps
         if sampler == "few" and not tuned:
-            raise ConfigError("scene.sampler: 'few', but these weights were not tuned for few steps; use dpmpp, ddim or ddpm")
+            raise ConfigError("place.sampler: 'few', but these weights were not tuned for few steps; use dpmpp, ddim or ddpm")
         if tuned and sampler not in ("auto", "few"):
-            raise ConfigError(f"scene.sampler: {sampler!r}, but these weights were tuned for {tuned} steps; use auto")
+            raise ConfigError(f"place.sampler: {sampler!r}, but these weights were tuned for {tuned} steps; use auto")
         if self.config.network.attention_heads and windows.num_agents > MAX_AGENTS:
             raise ConfigError(
                 f"infer.checkpoint: this checkpoint draws at most {MAX_AGENTS} agents together, here are {windows.num_agents}; "
                 "choose one without attention between agents, such as 'general'"
             )
 
-    def _sample_rows(self, network: FrozenScene, windows: WindowBatch, team: Team | None, num_hypotheses: int) -> Tensor:
+    def _sample_rows(self, network: FrozenPlace, windows: WindowBatch, team: Team | None, num_hypotheses: int) -> Tensor:
         """Hypotheses [R, K, T, 2] in metres relative to the datum."""
-        context = windows.required_context("SceneModel")
-        inputs = scene_inputs(windows, self.config)
+        context = windows.required_context("PlaceModel")
+        inputs = place_inputs(windows, self.config)
         stream = RowNoise(windows.seeds)
         last_m = _last_detection(windows.detections)
         tracks = _Tracks(self, inputs.pieces, last_m, context)
@@ -168,12 +168,12 @@ class SceneModel:
 
         Where agents see each other a hypothesis is one of all of them, and none is drawn again for itself.
         """
-        context = windows.required_context("SceneModel")
-        place = Place(context.obstacles, self.sampling.margin_m, context.datum_m[:, None, None])
+        context = windows.required_context("PlaceModel")
+        keep_out = KeepOut(context.obstacles, self.sampling.margin_m, context.datum_m[:, None, None])
         is_first = torch.arange(positions.shape[2]) == 0
         is_pinned = ((pieces.start[:, :1] >= 0) & is_first)[:, None].expand(positions.shape[:-1])
         longest_m = self.config.max_step_m
-        moved, is_clear = within_limits(positions, place, is_pinned, longest_m, is_first.expand(positions.shape[:-1]))
+        moved, is_clear = within_limits(positions, keep_out, is_pinned, longest_m, is_first.expand(positions.shape[:-1]))
         is_kept = is_clear & ~exceeds(moved, longest_m)
         if team is None:
             moved, _ = redrawn(moved, torch.ones_like(is_kept, dtype=torch.float64), is_kept, windows.seeds)
@@ -194,7 +194,7 @@ class SceneModel:
 class _Tracks:
     """What moves the pieces [R, K, P, 2] of one chunk of windows: the speed limit, and obstacles."""
 
-    def __init__(self, model: SceneModel, pieces: Pieces, last_m: Tensor, context: Context) -> None:
+    def __init__(self, model: PlaceModel, pieces: Pieces, last_m: Tensor, context: Context) -> None:
         self.config, self.sampling, self.obstacles = model.config, model.sampling, context.obstacles
         self.pieces, self.last_m = pieces, last_m[:, None, None].float()
         self.offset_m = context.datum_m[:, None, None].float()

@@ -2,9 +2,9 @@
 
 The prison world's only mountain, its keep-out circle by which the paper counts collisions: share of states and of straight ways
 between states inside it without guidance, with the paper's algorithm 1 and with ours, on windows at random and on windows whose
-true future passes near. Blocks of scores are kept (see scene_samplers.py, whose blocks are shared).
+true future passes near. Blocks of scores are kept (see place_samplers.py, whose blocks are shared).
 
-    python -m benchmarks.scene_guidance --publish docs
+    python -m benchmarks.place_guidance --publish docs
 """
 
 import argparse
@@ -19,8 +19,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
 from benchmarks import publishing
-from benchmarks.publishing import Measurement
-from benchmarks.scene_samplers import (
+from benchmarks.place_samplers import (
     DDPM,
     DEFAULT,
     PAPER,
@@ -40,9 +39,10 @@ from benchmarks.scene_samplers import (
     started,
     truth_scores,
 )  # fmt: skip
+from benchmarks.publishing import Measurement
 from cadence.arrays import Float64s
 from cadence.constraints.checker import states_in_collision
-from cadence.diffusion.scene import SceneModel, SceneSampling
+from cadence.diffusion.place import PlaceModel, PlaceSampling
 from cadence.metrics import Interval, bootstrap_ratio
 from cadence.recordings import ForecastWindows, Recordings, choose_windows
 from cadence.worlds import prison_map
@@ -63,18 +63,18 @@ MOMENTS = ("at random", "near the mountain")
 _INK, _PATH, _SEEN, _ROCK = "#1d2733", "#2a6f97", "#e8a33d", "#8d8478"
 
 
-def models_of(trained: dict[str, SceneModel]) -> dict[str, SceneModel]:
+def models_of(trained: dict[str, PlaceModel]) -> dict[str, PlaceModel]:
     """Every way of guiding, by name; the paper's needs DDPM, which needs weights that are not tuned for few steps."""
     ours = trained.get("tuned", trained["plain"])
     found = {
         name: dataclasses.replace(ours, sampling=sampling)
         for name, sampling in {
-            UNGUIDED: SceneSampling(guidance="none", is_repaired=False),
-            DEFAULT: SceneSampling(),
-            GUIDED: SceneSampling(guidance="clean", is_repaired=False),
-            BOTH: SceneSampling(guidance="clean"),
-            MOVED: SceneSampling(is_repaired=False),
-            REPAIRED: SceneSampling(guidance="none"),
+            UNGUIDED: PlaceSampling(guidance="none", is_repaired=False),
+            DEFAULT: PlaceSampling(),
+            GUIDED: PlaceSampling(guidance="clean", is_repaired=False),
+            BOTH: PlaceSampling(guidance="clean"),
+            MOVED: PlaceSampling(is_repaired=False),
+            REPAIRED: PlaceSampling(guidance="none"),
         }.items()
     }
     theirs = {
@@ -139,7 +139,7 @@ def section(measured: Measurement) -> str:
     return publishing.table(heads, lines)
 
 
-def draw(trained: dict[str, SceneModel], task: Task) -> Figure:
+def draw(trained: dict[str, PlaceModel], task: Task) -> Figure:
     """The window that unguided hypotheses take into the mountain most often, three ways."""
     models = models_of(trained)
     block = _worst(models[UNGUIDED], task)
@@ -155,7 +155,7 @@ def draw(trained: dict[str, SceneModel], task: Task) -> Figure:
     return figure
 
 
-def _worst(model: SceneModel, task: Task) -> ForecastWindows:
+def _worst(model: PlaceModel, task: Task) -> ForecastWindows:
     found, share = None, -1.0
     for block in task.blocks.values():
         drawn = sampled(model, block, task)[0].position_m
@@ -212,8 +212,8 @@ def main() -> int:
         for moments, task, scores in zip(MOMENTS, tasks, results, strict=True)
         for row in rows_of(moments, scores, truth_scores(task))
     ]
-    facts = facts_of("scene_guidance", options, tasks[0]) | {"num_near_windows": tasks[1].num_windows}
-    publishing.publish(Measurement("scene_guidance", facts, {"scene_guidance": rows}), section, options.publish)
+    facts = facts_of("place_guidance", options, tasks[0]) | {"num_near_windows": tasks[1].num_windows}
+    publishing.publish(Measurement("place_guidance", facts, {"place_guidance": rows}), section, options.publish)
     if options.publish is not None:
         draw(trained, tasks[1]).savefig(options.publish / "images" / "guidance.png", dpi=90)
     return 0 if _holds(results[0]) else 1

@@ -1,4 +1,4 @@
-"""Windows of several agents through the scene model: rows, absence, joint samples, shared detections, training."""
+"""Windows of several agents through the place model: rows, absence, joint samples, shared detections, training."""
 
 import dataclasses
 
@@ -6,21 +6,21 @@ import numpy as np
 import pytest
 import torch
 
-from cadence.diffusion.scene import SceneModel, SceneSampling
-from cadence.diffusion.scene_frame import SceneConfig, scene_inputs
-from cadence.diffusion.scene_team import agent_rows, shared_detections
+from cadence.diffusion.place import PlaceModel, PlaceSampling
+from cadence.diffusion.place_frame import PlaceConfig, place_inputs
+from cadence.diffusion.place_team import agent_rows, shared_detections
 from cadence.errors import ConfigError
 from cadence.network.attention import MAX_AGENTS
-from cadence.network.frozen import FrozenScene
-from cadence.network.scene import SceneNetworkConfig
+from cadence.network.frozen import FrozenPlace
+from cadence.network.place import PlaceNetworkConfig
 from cadence.recordings import ForecastWindows, Recordings, cut_windows
-from cadence.training.scene import Dropout, diffusion_loss, energy_loss, scene_windows
+from cadence.training.place_losses import Dropout, diffusion_loss, energy_loss, place_windows
 from cadence.types import Context, Detections, WindowBatch
 
-SMALL = SceneNetworkConfig(
+SMALL = PlaceNetworkConfig(
     width=16, multipliers=(1, 2), encoder_size=8, code_size=16, level_size=8, max_detections=12, map_cells=8, map_channels=2
 )
-ALONE = SceneConfig(SMALL, centre_m=(5000.0, 5000.0), scale_m=5000.0, unit_step_m=60.0, max_step_m=100.0)
+ALONE = PlaceConfig(SMALL, centre_m=(5000.0, 5000.0), scale_m=5000.0, unit_step_m=60.0, max_step_m=100.0)
 TOGETHER = dataclasses.replace(ALONE, network=dataclasses.replace(SMALL, attention_heads=2))
 SHARED = dataclasses.replace(TOGETHER, shared_gap_steps=100)
 
@@ -55,13 +55,13 @@ def without(cut: ForecastWindows, window: int, agent: int) -> WindowBatch:
     return dataclasses.replace(w, detections=d)
 
 
-def model(config: SceneConfig) -> SceneModel:
+def model(config: PlaceConfig) -> PlaceModel:
     torch.manual_seed(0)
     network = config.build()
     torch.nn.init.normal_(network.unet.head.weight, std=0.3)
     for across in network.unet.across:
         torch.nn.init.normal_(across.write.weight, std=0.3)
-    return SceneModel(network.eval(), config, SceneSampling(num_steps=3))
+    return PlaceModel(network.eval(), config, PlaceSampling(num_steps=3))
 
 
 def test_a_window_holds_all_agents_of_an_episode_and_each_as_if_alone() -> None:
@@ -105,7 +105,7 @@ def test_rows_of_independent_agents_are_those_that_are_there() -> None:
 
 
 @pytest.mark.parametrize("config", [ALONE, TOGETHER])
-def test_an_absent_agent_changes_nothing_for_the_others_but_that_it_is_not_there(config: SceneConfig) -> None:
+def test_an_absent_agent_changes_nothing_for_the_others_but_that_it_is_not_there(config: PlaceConfig) -> None:
     cut, estimator = windows(), model(config)
     drawn = estimator.sample(without(cut, 1, 2), 4)
     assert drawn.position_m.shape == (3, 4, 3, 120, 2)
@@ -143,8 +143,8 @@ def test_a_windows_draws_do_not_depend_on_its_neighbours_or_chunks() -> None:
 def test_laid_out_for_sampling_agents_see_each_other_as_in_the_network() -> None:
     cut, estimator = windows(), model(TOGETHER)
     rows = agent_rows(without(cut, 1, 2), TOGETHER)
-    inputs = scene_inputs(rows.windows, TOGETHER)
-    frozen = FrozenScene(estimator.network)
+    inputs = place_inputs(rows.windows, TOGETHER)
+    frozen = FrozenPlace(estimator.network)
     noisy = torch.randn(2 * len(inputs), TOGETHER.num_pieces, 2, generator=torch.Generator().manual_seed(0))
     twice = inputs.repeated(2)
     assert rows.team is not None
@@ -179,10 +179,10 @@ def test_with_shared_detections_every_agent_is_drawn() -> None:
 
 
 @pytest.mark.parametrize("config", [TOGETHER, SHARED])
-def test_training_windows_are_the_truth_and_absent_agents_cost_nothing(config: SceneConfig) -> None:
+def test_training_windows_are_the_truth_and_absent_agents_cost_nothing(config: PlaceConfig) -> None:
     rec, rng = recordings(), np.random.default_rng(0)
     rows = rec.offset[[0, 3, 6, 9, 0, 3]] + np.array([2, 3, 2, 4, 30, 5])  # early: not everybody was detected yet
-    found = scene_windows(rec, rows, config, Dropout(known_start=0.0), rng)
+    found = place_windows(rec, rows, config, Dropout(known_start=0.0), rng)
     assert found.team is not None and len(found) == 3 * len(found.team.is_present)
     assert config.shared_gap_steps or not bool(found.is_real.all())  # otherwise this tests nothing
     network = model(dataclasses.replace(config, few_steps=2)).network

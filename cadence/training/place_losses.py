@@ -1,4 +1,4 @@
-"""Training of scene networks: windows out of recordings, the diffusion loss, and the energy score of a few-step sampler."""
+"""Training of place networks: windows out of recordings, the diffusion loss, and the energy score of a few-step sampler."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -8,11 +8,11 @@ import torch
 from torch import Tensor
 
 from cadence.arrays import Int64s
+from cadence.diffusion.place_frame import PlaceConfig, place_inputs, recorded_track, to_pieces
+from cadence.diffusion.place_team import agent_rows, shared_detections
 from cadence.diffusion.sampler import even_angles, sample_ddim
-from cadence.diffusion.scene_frame import SceneConfig, recorded_track, scene_inputs, to_pieces
-from cadence.diffusion.scene_team import agent_rows, shared_detections
 from cadence.network.attention import Team
-from cadence.network.scene import Pieces, SceneInputs, SceneNetwork
+from cadence.network.place import Pieces, PlaceInputs, PlaceNetwork
 from cadence.recordings import NUM_STEPS, Recordings, cut_windows
 from cadence.schedule import MAX_ANGLE, clean_from
 
@@ -36,13 +36,13 @@ class Dropout:
 
 
 @dataclass(frozen=True, eq=False)
-class SceneWindows:
+class PlaceWindows:
     """Training windows, an agent a row: what is known of them, and the true track as pieces [R, P, 2].
 
     is_real [R] bool; other rows stand for absent agents. team: which rows see each other; None: none do.
     """
 
-    inputs: SceneInputs
+    inputs: PlaceInputs
     clean: Tensor
     is_real: Tensor
     team: Team | None = None
@@ -50,19 +50,19 @@ class SceneWindows:
     def __len__(self) -> int:
         return len(self.clean)
 
-    def parts(self, num_rows: int) -> Iterator["SceneWindows"]:
+    def parts(self, num_rows: int) -> Iterator["PlaceWindows"]:
         """The windows in parts of about so many rows, the agents of a window together."""
         size = 1 if self.team is None else self.team.num_agents
         num = max(1, num_rows // size)
         for begin in range(0, len(self) // size, num):
             pick = slice(begin * size, (begin + num) * size)
             team = self.team and self.team[slice(begin, begin + num)]
-            yield SceneWindows(self.inputs[pick], self.clean[pick], self.is_real[pick], team)
+            yield PlaceWindows(self.inputs[pick], self.clean[pick], self.is_real[pick], team)
 
 
-def scene_windows(
-    recordings: Recordings, rows: Int64s, config: SceneConfig, told: Dropout, rng: np.random.Generator
-) -> SceneWindows:
+def place_windows(
+    recordings: Recordings, rows: Int64s, config: PlaceConfig, told: Dropout, rng: np.random.Generator
+) -> PlaceWindows:
     """Windows whose origins are the given rows of the recordings; those without any detection are left out.
 
     A row of a track among several means the whole episode's window at that step: all of its agents.
@@ -83,16 +83,16 @@ def scene_windows(
     )
     told_windows = (shared_detections(cut.windows) if config.shared_gap_steps else cut.windows).with_context(told_context)
     found = agent_rows(told_windows, config)
-    inputs = scene_inputs(found.windows, config)
+    inputs = place_inputs(found.windows, config)
     track = episode[found.window] * recordings.num_agents + found.agent.numpy()
     now = recordings.offset[track] + step[found.window]
     track_m = recorded_track(recordings, now, track, inputs.pieces)
     if config.shared_gap_steps:
         track_m = _led_from_last(track_m, inputs.pieces, config)
-    return SceneWindows(inputs, to_pieces(track_m, inputs.pieces, config), found.is_real, found.team)
+    return PlaceWindows(inputs, to_pieces(track_m, inputs.pieces, config), found.is_real, found.team)
 
 
-def _led_from_last(track_m: Tensor, pieces: Pieces, config: SceneConfig) -> Tensor:
+def _led_from_last(track_m: Tensor, pieces: Pieces, config: PlaceConfig) -> Tensor:
     """Tracks [R, P + 1, 2] whose way to now is the straight one from the last detection of anybody."""
     last_m = pieces.last.double() * config.scale_m + torch.tensor(config.centre_m, dtype=torch.float64)
     share = torch.linspace(0.0, 1.0, config.num_gap + 1, dtype=torch.float64)[:, None]
@@ -101,7 +101,7 @@ def _led_from_last(track_m: Tensor, pieces: Pieces, config: SceneConfig) -> Tens
 
 
 def diffusion_loss(
-    network: SceneNetwork, windows: SceneWindows, config: SceneConfig, path_weight: float, generator: torch.Generator
+    network: PlaceNetwork, windows: PlaceWindows, config: PlaceConfig, path_weight: float, generator: torch.Generator
 ) -> Tensor:
     """Mean square error of the velocity: of every piece, and `path_weight` times that of the positions it adds up to.
 
@@ -127,7 +127,7 @@ def diffusion_loss(
 
 
 def few_step_sample(
-    network: SceneNetwork, pieces: Pieces, code: Tensor, noise: Tensor, num_steps: int, team: Team | None = None
+    network: PlaceNetwork, pieces: Pieces, code: Tensor, noise: Tensor, num_steps: int, team: Team | None = None
 ) -> Tensor:
     """Clean pieces [R, P, 2] from standard normal `noise` in `num_steps` evaluations (DDIM); gradients pass through."""
 
@@ -139,9 +139,9 @@ def few_step_sample(
 
 
 def energy_loss(
-    network: SceneNetwork,
-    windows: SceneWindows,
-    config: SceneConfig,
+    network: PlaceNetwork,
+    windows: PlaceWindows,
+    config: PlaceConfig,
     num_samples: int,
     weights: tuple[float, float],
     generator: torch.Generator,

@@ -4,7 +4,7 @@ Every variant draws the same number of hypotheses for the same windows of the pr
 blocks of windows in the work folder: a killed run goes on where it was, and more windows can be added. Speeds are ratios of
 processor times on one thread, all variants one after the other in every round, the order reversed in every other round.
 
-    python -m benchmarks.scene_samplers --publish docs
+    python -m benchmarks.place_samplers --publish docs
 """
 
 import argparse
@@ -24,7 +24,7 @@ from benchmarks import publishing
 from benchmarks.publishing import Measurement
 from cadence.arrays import Int64s
 from cadence.constraints.obstacles import Obstacles
-from cadence.diffusion.scene import SceneModel, SceneSampling
+from cadence.diffusion.place import PlaceModel, PlaceSampling
 from cadence.errors import CadenceError
 from cadence.metrics import Interval, bootstrap_ratio
 from cadence.recordings import ForecastWindows, Recordings, choose_windows, cut_windows
@@ -32,7 +32,7 @@ from cadence.types import HypothesisSet
 from cadence.worlds import prison_map
 from pipeline.checkpoints import checkpoint_hash, find_checkpoint
 from pipeline.episodes.recordings import RecordingsConfig, load_recordings
-from pipeline.estimators.scene import load_scene
+from pipeline.estimators.place import load_place_model
 from pipeline.files import write_atomic
 from pipeline.forecast.scores import HORIZONS, EpisodeScores, score_forecasts, step_quantiles
 from pipeline.progress import Progress
@@ -41,14 +41,14 @@ DATA = Path(__file__).resolve().parents[1].parent / "shared" / "data" / "prison_
 SETS = ("low", "med", "high")
 VALIDATION = "*_02[5-9]?.mcap"
 """Episodes 250 to 299 of each set."""
-WORK = Path("out/benchmarks/scene")
+WORK = Path("out/benchmarks/place")
 STEPS = (5, 8, 15, 25)
 LEVELS = (0.05, 0.25, 0.5, 0.75, 0.95, 0.99)
 SIDE_M = prison_map.SIDE * prison_map.CELL_M
 CLAIM, TOLERANCE = 20.0, 1.02
 
-PLAIN = SceneSampling(guidance="none", is_repaired=False, is_antithetic=False)
-PAPER = SceneSampling(sampler="ddpm", num_steps=100, guidance="paper", is_repaired=False)
+PLAIN = PlaceSampling(guidance="none", is_repaired=False, is_antithetic=False)
+PAPER = PlaceSampling(sampler="ddpm", num_steps=100, guidance="paper", is_repaired=False)
 
 
 @dataclass(frozen=True)
@@ -56,8 +56,8 @@ class Variant:
     """A row: how it samples, for its scores and for its speed, and whether with the tuned weights."""
 
     name: str
-    sampling: SceneSampling
-    timed: SceneSampling | None = None
+    sampling: PlaceSampling
+    timed: PlaceSampling | None = None
     is_tuned: bool = False
 
 
@@ -101,9 +101,9 @@ def variants(has_tuned: bool) -> list[Variant]:
     rows.append(Variant("default in bfloat16", rounded))
     if has_tuned:
         rows.append(Variant("few steps, tuned weights", dataclasses.replace(PLAIN, sampler="few"), is_tuned=True))
-        rows.append(Variant(TUNED, SceneSampling(sampler="few"), is_tuned=True))
-    rows.append(Variant(INDEPENDENT, SceneSampling(is_antithetic=False)))
-    rows.append(Variant(DEFAULT, SceneSampling()))
+        rows.append(Variant(TUNED, PlaceSampling(sampler="few"), is_tuned=True))
+    rows.append(Variant(INDEPENDENT, PlaceSampling(is_antithetic=False)))
+    rows.append(Variant(DEFAULT, PlaceSampling()))
     return rows
 
 
@@ -139,7 +139,7 @@ def block_of(recordings: Recordings, number: int, episode: Int64s, step: Int64s,
     return dataclasses.replace(cut, episode=cut.episode + 10_000 * number)
 
 
-def sampled(model: SceneModel, block: ForecastWindows, task: Task) -> tuple[HypothesisSet, float]:
+def sampled(model: PlaceModel, block: ForecastWindows, task: Task) -> tuple[HypothesisSet, float]:
     """Hypotheses of a block and the processor time they took."""
     begin = time.process_time()
     context = dataclasses.replace(block.context, obstacles=task.obstacles)
@@ -152,7 +152,7 @@ def score(block: ForecastWindows, drawn: HypothesisSet, task: Task, seconds: flo
     return score_forecasts(drawn, block.truth_m, block.episode, block.context.datum_m, task.obstacles, seconds=seconds)
 
 
-def score_all(task: Task, models: dict[str, SceneModel]) -> dict[str, EpisodeScores]:
+def score_all(task: Task, models: dict[str, PlaceModel]) -> dict[str, EpisodeScores]:
     """Every model on every block; what is in the work folder is not done again."""
     parts: dict[str, list[EpisodeScores]] = {name: [] for name in models}
     with Progress().bar(len(task.blocks) * len(models), "score", "block") as bar:
@@ -164,7 +164,7 @@ def score_all(task: Task, models: dict[str, SceneModel]) -> dict[str, EpisodeSco
     return {name: EpisodeScores.add(rows) for name, rows in parts.items()}
 
 
-def _kept_score(model: SceneModel, key: str, block: ForecastWindows, task: Task) -> EpisodeScores:
+def _kept_score(model: PlaceModel, key: str, block: ForecastWindows, task: Task) -> EpisodeScores:
     what = repr((model.sampling, task.num_hypotheses, block.windows.seeds.tolist(), _digest(model)))
     path = task.work / f"{key}-{hashlib.sha256(what.encode()).hexdigest()[:24]}.json"
     if path.is_file():
@@ -175,7 +175,7 @@ def _kept_score(model: SceneModel, key: str, block: ForecastWindows, task: Task)
     return found
 
 
-def _digest(model: SceneModel) -> str:
+def _digest(model: PlaceModel) -> str:
     total = hashlib.sha256(repr(model.config).encode())
     for value in model.network.state_dict().values():
         total.update(value.numpy().tobytes())
@@ -192,7 +192,7 @@ def truth_scores(task: Task) -> EpisodeScores:
     return EpisodeScores.add(parts)
 
 
-def time_all(task: Task, models: dict[str, SceneModel], num_windows: int, rounds: int) -> dict[str, list[float]]:
+def time_all(task: Task, models: dict[str, PlaceModel], num_windows: int, rounds: int) -> dict[str, list[float]]:
     """Processor seconds of every model on the first windows of the first blocks, round by round."""
     keys = list(task.blocks)[: min(len(task.blocks), len(SETS))]
     some = [task.blocks[key][: max(1, num_windows // len(keys))] for key in keys]
@@ -212,7 +212,7 @@ def time_all(task: Task, models: dict[str, SceneModel], num_windows: int, rounds
     return seconds
 
 
-def _short(sampling: SceneSampling) -> SceneSampling:
+def _short(sampling: PlaceSampling) -> PlaceSampling:
     return dataclasses.replace(sampling, num_steps=1)
 
 
@@ -281,7 +281,7 @@ def section(measured: Measurement) -> str:
 
 
 def parser() -> argparse.ArgumentParser:
-    """What the scene benchmarks have in common."""
+    """What the place benchmarks have in common."""
     made = argparse.ArgumentParser(formatter_class=argparse.RawDescriptionHelpFormatter)
     made.add_argument("--checkpoint", default="prison", help="trained by diffusion: a file or a shipped name")
     made.add_argument("--tuned", help="the same, tuned for few steps: two rows more")
@@ -295,12 +295,12 @@ def parser() -> argparse.ArgumentParser:
     return made
 
 
-def started(options: argparse.Namespace) -> dict[str, SceneModel] | None:
+def started(options: argparse.Namespace) -> dict[str, PlaceModel] | None:
     """The models of the checkpoints, "plain" and "tuned"; None, with the reason printed, where something is not here."""
     torch.set_num_threads(1)
     try:
         names = {"plain": options.checkpoint} | ({"tuned": options.tuned} if options.tuned else {})
-        models = {kind: load_scene(find_checkpoint(name)) for kind, name in names.items()}
+        models = {kind: load_place_model(find_checkpoint(name)) for kind, name in names.items()}
     except CadenceError as error:
         print(f"skipped: {error}")
         return None
@@ -348,13 +348,13 @@ def main() -> int:
     quality = ratio(claimed[DEFAULT], claimed[DDPM], "energy_score")
     found = {**spread_of("speed", speed), **publishing.columns("energy_ratio", quality), "num_windows": claim.num_windows}
     tables = {
-        "scene_samplers": main_rows(scores, seconds), "scene_samplers_claim": [found],
-        "scene_samplers_steps": step_rows({"the true tracks": truth_scores(task)} | scores),
-        "scene_samplers_horizons": horizon_rows(scores),
+        "place_samplers": main_rows(scores, seconds), "place_samplers_claim": [found],
+        "place_samplers_steps": step_rows({"the true tracks": truth_scores(task)} | scores),
+        "place_samplers_horizons": horizon_rows(scores),
     }  # fmt: skip
-    facts = facts_of("scene_samplers", options, task)
+    facts = facts_of("place_samplers", options, task)
     facts |= {"num_rounds": options.rounds, "num_timed_windows": options.timed_windows}
-    publishing.publish(Measurement("scene_samplers", facts, tables), section, options.publish)
+    publishing.publish(Measurement("place_samplers", facts, tables), section, options.publish)
     return 0 if statistics.median(speed) >= CLAIM and quality.value <= TOLERANCE else 1
 
 

@@ -1,12 +1,12 @@
-"""What does each input and output of the scene preset bring, and how many training episodes does it need?
+"""What does each input and output of the place preset bring, and how many training episodes does it need?
 
 Variants of the preset are trained on the rebuilt Prison Escape (all three sets) at one small budget and evaluated on the same
 windows: of simulated episodes with a seed of their own, and of episodes of the original simulator, which none has seen.
 Everything is kept under --work: a killed run goes on where it was, and what is published is whatever is there.
 
-    python -m benchmarks.scene_ablations --reference ../shared/data/prison_reference --publish docs
-    python -m benchmarks.scene_ablations --only full,no_map --steps 1500 --seeds 0,1
-    python -m benchmarks.scene_ablations --page --publish docs
+    python -m benchmarks.place_ablations --reference ../shared/data/prison_reference --publish docs
+    python -m benchmarks.place_ablations --only full,no_map --steps 1500 --seeds 0,1
+    python -m benchmarks.place_ablations --page --publish docs
 """
 
 import argparse
@@ -25,25 +25,25 @@ from benchmarks import publishing
 from benchmarks.leads import averaged, relative_lead
 from benchmarks.publishing import Measurement
 from benchmarks.table1_page import MINUTES
-from cadence.diffusion.scene import SceneSampling
-from cadence.diffusion.scene_frame import SceneConfig
+from cadence.diffusion.place import PlaceSampling
+from cadence.diffusion.place_frame import PlaceConfig
 from cadence.errors import InputError
 from cadence.metrics import Interval
-from cadence.network.scene import SceneNetwork
+from cadence.network.place import PlaceNetwork
 from cadence.recordings import Recordings
 from cadence.training.loop import OptimiserConfig, untrained
 from cadence.worlds.prison_map import SIDE, prison_map
 from pipeline.checkpoints import checkpoint_hash, read_info
 from pipeline.episodes.pool import EpisodePool, EpisodeSource
 from pipeline.episodes.recordings import RecordingsConfig, load_recordings, read_recordings
-from pipeline.estimators.scene import load_scene
+from pipeline.estimators.place import load_place_model
 from pipeline.files import write_atomic
 from pipeline.forecast.scores import HORIZONS, EpisodeScores
 from pipeline.forecast.stage import ForecastConfig, ForecastRun, forecast_windows
 from pipeline.forecast.tables import comparison, mean_interval
 from pipeline.progress import Progress
-from pipeline.train.config import SceneTraining, TrainConfig
-from pipeline.train.scene import train_scene_network
+from pipeline.train.config import PlaceTraining, TrainConfig
+from pipeline.train.place import train_place_network
 
 SETS = ("low", "med", "high")
 KINDS = ("simulated", "original")
@@ -53,7 +53,7 @@ SIDE_M = 2428 * 21.0
 MAP_CELLS = 128
 """Of the true coverage map; a cell is about as large as the blocks on which fugitives plan their routes."""
 NUM_RESAMPLES = 1000
-SAMPLING = SceneSampling(is_antithetic=False)
+SAMPLING = PlaceSampling(is_antithetic=False)
 """Of all variants: as it was when the first were scored, so that those which are kept compare with new ones."""
 
 
@@ -62,14 +62,14 @@ class Variant:
     """One training: what is different in it, in words and in settings."""
 
     title: str
-    model: SceneConfig = dataclasses.field(default_factory=SceneConfig)
+    model: PlaceConfig = dataclasses.field(default_factory=PlaceConfig)
     num_episodes: int = 4000
     path_weight: float = 1.0
     true_map: bool = False
 
 
 def _with(title: str, **network: object) -> Variant:
-    model = SceneConfig()
+    model = PlaceConfig()
     return Variant(title, dataclasses.replace(model, network=dataclasses.replace(model.network, **network)))  # type: ignore[arg-type]
 
 
@@ -155,17 +155,17 @@ def train_config(variant: Variant, setup: Setup, seed: int) -> TrainConfig:
     """The training of a variant; everything that is not varied is the preset's default."""
     of = functools.partial(RecordingsConfig, data=setup.data, num_episodes=variant.num_episodes)
     sources = tuple(EpisodeSource(1.0, of(set=name)) for name in SETS)  # type: ignore[arg-type]
-    scene = SceneTraining(variant.model, sources=sources, path_weight=variant.path_weight, num_validation_windows=200)
+    place = PlaceTraining(variant.model, sources=sources, path_weight=variant.path_weight, num_validation_windows=200)
     warm_up = min(300, max(1, setup.steps // 5))
     optimiser = OptimiserConfig(learning_rate=1e-3, num_steps=setup.steps, warm_up_steps=warm_up, bf16=True)
     every = max(1, setup.steps // 3)
     return TrainConfig(
-        "scene", seed=seed, batch_size=setup.batch_size, validate_every=every, save_every=min(100, every), optimiser=optimiser,
-        scene=scene,
+        "place", seed=seed, batch_size=setup.batch_size, validate_every=every, save_every=min(100, every), optimiser=optimiser,
+        place=place,
     )  # fmt: skip
 
 
-def build(variant: Variant, seed: int) -> SceneNetwork:
+def build(variant: Variant, seed: int) -> PlaceNetwork:
     """The untrained network; the true map is fixed in it."""
     network = untrained(variant.model.build, seed)
     if variant.true_map:
@@ -194,10 +194,10 @@ def run_variant(
     simulated = [run.episodes.recordings for key, run in runs.items() if key.startswith("simulated")]
     held_out = EpisodePool(tuple(simulated), (1.0,) * len(simulated))
     config = train_config(variant, setup, seed)
-    result = train_scene_network(out, config, build(variant, seed), load(variant.num_episodes), held_out, setup.progress)
+    result = train_place_network(out, config, build(variant, seed), load(variant.num_episodes), held_out, setup.progress)
     weights = result.outputs[0]
     seconds = read_info(weights).training["cpu_seconds"]
-    estimate = functools.partial(load_scene, weights, SAMPLING)
+    estimate = functools.partial(load_place_model, weights, SAMPLING)
     scores = {key: run.score(f"{name}-{key}", estimate, [checkpoint_hash(weights)]).as_json() for key, run in runs.items()}
     record = {"variant": name, "seed": seed, "steps": setup.steps, "cpu_seconds": seconds}
     write_atomic(path, json.dumps({**record, "validation_loss": result.summary["validation_loss"], "scores": scores}) + "\n")
@@ -290,16 +290,16 @@ def publish(setup: Setup, seeds: Sequence[int], docs: Path | None) -> None:
     if "full" not in results:
         setup.progress.note("nothing to publish yet: the full variant is not done")
         return
-    facts = publishing.facts_of("scene_ablations") | {
+    facts = publishing.facts_of("place_ablations") | {
         "num_trainings": min(counts.values()), "num_windows": setup.num_windows, "num_steps": setup.steps,
         "batch_size": setup.batch_size, "not_run": [variant.title for name, variant in ALL.items() if name not in results],
     }  # fmt: skip
     tables = {
-        "scene_ablations": list(cost_rows(results)),
-        "scene_ablations_curve": list(curve_rows(results)),
-        "scene_ablations_errors": list(error_rows(results)),
+        "place_ablations": list(cost_rows(results)),
+        "place_ablations_curve": list(curve_rows(results)),
+        "place_ablations_errors": list(error_rows(results)),
     }
-    publishing.publish(Measurement("scene_ablations", facts, tables), section, docs)
+    publishing.publish(Measurement("place_ablations", facts, tables), section, docs)
 
 
 def main() -> int:

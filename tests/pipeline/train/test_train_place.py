@@ -1,4 +1,4 @@
-"""Training of the scene preset: sources and their shares, resuming, the energy objective, checkpoints through infer."""
+"""Training of the place preset: sources and their shares, resuming, the energy objective, checkpoints through infer."""
 
 import csv
 import dataclasses
@@ -11,31 +11,31 @@ import torch
 from fixtures.killed_training import Killed, Killer
 
 from cadence.diffusion.feasible import GuidanceConfig
-from cadence.diffusion.scene import SceneSampling
-from cadence.diffusion.scene_frame import SceneConfig
+from cadence.diffusion.place import PlaceSampling
+from cadence.diffusion.place_frame import PlaceConfig
 from cadence.errors import ConfigError, InputError
-from cadence.network.scene import SceneNetworkConfig
+from cadence.network.place import PlaceNetworkConfig
 from cadence.recordings import Recordings, cut_windows
 from cadence.training.loop import OptimiserConfig
 from pipeline.checkpoints import read_info
 from pipeline.episodes.pool import EpisodeSource
 from pipeline.episodes.recordings import RecordingsConfig, save_recordings
-from pipeline.estimators.scene import load_scene
+from pipeline.estimators.place import load_place_model
 from pipeline.evaluate.stage import EvaluateConfig, evaluate
 from pipeline.infer.config import InferConfig
 from pipeline.infer.stage import infer
 from pipeline.progress import Progress
 from pipeline.tables import Frame, read_table, write_table
-from pipeline.train.config import SceneTraining, TrainConfig
+from pipeline.train.config import PlaceTraining, TrainConfig
 from pipeline.train.stage import train
 from schemas.tables import DETECTIONS, TRUTH
 
 QUIET = Progress(quiet=True)
 START_NS = 1_700_000_000_000_000_000
-NETWORK = SceneNetworkConfig(
+NETWORK = PlaceNetworkConfig(
     width=8, multipliers=(1, 2), encoder_size=8, code_size=8, level_size=8, max_detections=10, map_cells=4, map_channels=2
 )
-MODEL = SceneConfig(NETWORK, centre_m=(0.0, 0.0), scale_m=5000.0, unit_step_m=60.0, max_step_m=100.0)
+MODEL = PlaceConfig(NETWORK, centre_m=(0.0, 0.0), scale_m=5000.0, unit_step_m=60.0, max_step_m=100.0)
 
 
 def recordings(seed, num_trackers=2, step_s=60.0):
@@ -63,9 +63,9 @@ def sources(tmp_path_factory):
 
 
 def config(sources, num_steps=4, **changes):
-    scene = SceneTraining(MODEL, sources=sources, validation=sources[:1], num_validation_windows=20, **changes)
+    place = PlaceTraining(MODEL, sources=sources, validation=sources[:1], num_validation_windows=20, **changes)
     optimiser = OptimiserConfig(num_steps=num_steps, warm_up_steps=1, bf16=True)
-    return TrainConfig("scene", batch_size=12, validate_every=2, save_every=2, optimiser=optimiser, scene=scene)
+    return TrainConfig("place", batch_size=12, validate_every=2, save_every=2, optimiser=optimiser, place=place)
 
 
 def test_a_killed_training_goes_on_to_the_same_weights(sources, tmp_path):
@@ -74,7 +74,7 @@ def test_a_killed_training_goes_on_to_the_same_weights(sources, tmp_path):
         train(tmp_path / "killed", config(sources), Killer())
     assert (tmp_path / "killed" / "state.safetensors").is_file()
     again = train(tmp_path / "killed", config(sources), QUIET)
-    first, second = (load_scene(result.outputs[0]).network.state_dict() for result in (whole, again))
+    first, second = (load_place_model(result.outputs[0]).network.state_dict() for result in (whole, again))
     assert all(torch.equal(first[name], second[name]) for name in first)
     steps = [
         int(row[0]) for row in csv.reader((tmp_path / "killed" / "curve.csv").read_text().splitlines()) if row[0].isdigit()
@@ -86,8 +86,8 @@ def test_energy_tunes_a_trained_network_for_few_steps(sources, tmp_path):
     train(tmp_path / "first", config(sources), QUIET)
     start = str(tmp_path / "first" / "checkpoint.safetensors")
     tuned = train(tmp_path / "second", config(sources, 2, objective="energy", start=start, few_steps=3), QUIET)
-    model = load_scene(tuned.outputs[0])
-    assert model.config.few_steps == 3 and read_info(tuned.outputs[0]).preset == "scene"
+    model = load_place_model(tuned.outputs[0])
+    assert model.config.few_steps == 3 and read_info(tuned.outputs[0]).preset == "place"
     cut = cut_windows(recordings(3), np.array([0, 1]), np.array([10, 5]))
     assert bool(model.sample(cut.windows, 2).position_m.isfinite().all())
     with pytest.raises(ValueError, match="start"):
@@ -103,11 +103,11 @@ def test_episodes_with_another_step_are_refused(sources, tmp_path):
         train(tmp_path / "out", config((EpisodeSource(1.0, RecordingsConfig(data=tmp_path / "nowhere.npz")),)), QUIET)
 
 
-def test_infer_takes_a_scene_checkpoint(sources, tmp_path, mission_directory):
-    weights = train(tmp_path / "scene", config(sources), QUIET).outputs[0]
-    settings = InferConfig(num_hypotheses=3, checkpoint=str(weights), scene=SceneSampling(num_steps=2))
+def test_infer_takes_a_place_checkpoint(sources, tmp_path, mission_directory):
+    weights = train(tmp_path / "place", config(sources), QUIET).outputs[0]
+    settings = InferConfig(num_hypotheses=3, checkpoint=str(weights), place=PlaceSampling(num_steps=2))
     result = infer(mission_directory, settings, QUIET)
-    assert result.summary["preset"] == "scene" and result.summary["step_s"] == pytest.approx(60.0)
+    assert result.summary["preset"] == "place" and result.summary["step_s"] == pytest.approx(60.0)
     table, _ = read_table(mission_directory / "hypotheses.parquet", "hypotheses")
     assert table.num_rows == result.summary["num_tracks"] > 0
     assert set(table["origin_index"].to_pylist()) == {0} and table.schema.field("position_m").type.list_size == 120
@@ -115,14 +115,14 @@ def test_infer_takes_a_scene_checkpoint(sources, tmp_path, mission_directory):
     infer(mission_directory, settings, QUIET, force=True)
     assert (mission_directory / "hypotheses.parquet").read_bytes() == first
     assert json.loads((mission_directory / "infer.manifest.json").read_text())["summary"]["checkpoint"] == str(weights)
-    other = dataclasses.replace(settings, scene=SceneSampling(sampler="few"))
+    other = dataclasses.replace(settings, place=PlaceSampling(sampler="few"))
     with pytest.raises(ConfigError, match="not tuned"):
         infer(mission_directory, other, QUIET)
 
 
 def test_all_that_infer_saw_is_seen_by_those_it_is_compared_with(sources, tmp_path, mission_directory):
-    weights = train(tmp_path / "scene", config(sources), QUIET).outputs[0]
-    infer(mission_directory, InferConfig(num_hypotheses=3, checkpoint=str(weights), scene=SceneSampling(num_steps=2)), QUIET)
+    weights = train(tmp_path / "place", config(sources), QUIET).outputs[0]
+    infer(mission_directory, InferConfig(num_hypotheses=3, checkpoint=str(weights), place=PlaceSampling(num_steps=2)), QUIET)
     rows = [
         {"log_id": "walk", "time_ns": START_NS + minute * 60 * 10**9, "agent_id": agent, "x_m": 30.0 * minute, "y_m": y_m}
         for minute in range(300) for agent, y_m in (("T0", 0.0), ("T1", 500.0))
@@ -138,8 +138,8 @@ def test_all_that_infer_saw_is_seen_by_those_it_is_compared_with(sources, tmp_pa
     assert found["cadence"]["num_cells"] == found["cv"]["num_cells"] == 119 * num_drawn
 
 
-def test_the_limits_of_all_presets_hold_for_a_scene_checkpoint(sources, tmp_path, mission_directory):
-    weights = train(tmp_path / "scene", config(sources), QUIET).outputs[0]
+def test_the_limits_of_all_presets_hold_for_a_place_checkpoint(sources, tmp_path, mission_directory):
+    weights = train(tmp_path / "place", config(sources), QUIET).outputs[0]
     rock = {"kind": "circle", "x_m": 1500.0, "y_m": 250.0, "radius_m": 300.0}
     (mission_directory / "obstacles.json").write_text(json.dumps({"version": 1, "obstacles": [rock]}))
 

@@ -5,7 +5,7 @@ import dataclasses
 import torch
 from torch import Tensor
 
-from cadence.diffusion.scene_frame import SceneConfig
+from cadence.diffusion.place_frame import PlaceConfig
 from cadence.network.attention import Team
 from cadence.seeds import part_seeds
 from cadence.types import Detections, WindowBatch
@@ -28,7 +28,7 @@ class AgentRows:
     team: Team | None
 
 
-def agent_rows(windows: WindowBatch, config: SceneConfig) -> AgentRows:
+def agent_rows(windows: WindowBatch, config: PlaceConfig) -> AgentRows:
     """Every agent of every window of which anything is known.
 
     Without attention these are the agents with detections, each for itself. With it, all agents of windows with any detection,

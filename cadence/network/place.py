@@ -1,4 +1,4 @@
-"""The network of the scene preset: a temporal U-Net over a track's pieces that knows one place by heart.
+"""The network of the place preset: a temporal U-Net over a track's pieces that knows one place by heart.
 
 From the paper (Ye et al., CADENCE, MRS 2023): a temporal U-Net with FiLM at every block, conditioned on an LSTM over the
 detections. Beyond it: the track is stated as displacements from the last detection on, and along the track that the noisy state
@@ -23,8 +23,8 @@ _NUM_PIECE_FEATURES = 7
 
 
 @dataclass(frozen=True)
-class SceneNetworkConfig:
-    """Sizes and inputs of the scene preset's network.
+class PlaceNetworkConfig:
+    """Sizes and inputs of the place preset's network.
 
     width, multipliers, num_blocks, kernel_size  of the U-Net: channels of the first level, their multiples on every level
                     (each halves the pieces), residual blocks a level
@@ -59,7 +59,7 @@ class SceneNetworkConfig:
 
     def __post_init__(self) -> None:
         if self.map_channels < 0 or min(self.encoder_size, self.code_size, self.max_detections, self.map_cells) < 1:
-            raise ValueError("sizes of the scene network must be positive, map_channels not negative")
+            raise ValueError("sizes of the place network must be positive, map_channels not negative")
         self.unet()  # refuses sizes that cannot be
 
     def unet(self) -> UNetConfig:
@@ -102,7 +102,7 @@ class Pieces:
 
 
 @dataclass(frozen=True, eq=False)
-class SceneInputs:
+class PlaceInputs:
     """What is known of R windows, float32, in the units of `Pieces`.
 
     rows [R, N, F], is_observed [R, N]   detections, oldest first, left-packed
@@ -120,19 +120,19 @@ class SceneInputs:
     def __len__(self) -> int:
         return len(self.summary)
 
-    def __getitem__(self, pick: slice | Tensor) -> "SceneInputs":
+    def __getitem__(self, pick: slice | Tensor) -> "PlaceInputs":
         """A selection of windows."""
-        return SceneInputs(**{name: value[pick] for name, value in vars(self).items()})
+        return PlaceInputs(**{name: value[pick] for name, value in vars(self).items()})
 
-    def repeated(self, times: int) -> "SceneInputs":
+    def repeated(self, times: int) -> "PlaceInputs":
         """Every window `times` times in a row."""
         return self[torch.arange(len(self)).repeat_interleave(times)]
 
 
-class SceneNetwork(nn.Module):
-    """v-prediction of tracks as pieces [R, P, 2]; num_row, num_summary, num_tracker are the features in `SceneInputs`."""
+class PlaceNetwork(nn.Module):
+    """v-prediction of tracks as pieces [R, P, 2]; num_row, num_summary, num_tracker are the features in `PlaceInputs`."""
 
-    def __init__(self, config: SceneNetworkConfig, num_row: int, num_summary: int, num_tracker: int) -> None:
+    def __init__(self, config: PlaceNetworkConfig, num_row: int, num_summary: int, num_tracker: int) -> None:
         super().__init__()
         self.config = config
         self.unet = UNet(config.unet())
@@ -151,7 +151,7 @@ class SceneNetwork(nn.Module):
         self.map = nn.Parameter(torch.empty(1, config.map_channels, config.map_cells, config.map_cells))
         nn.init.normal_(self.map, std=0.3)
 
-    def encode(self, inputs: SceneInputs) -> Tensor:
+    def encode(self, inputs: PlaceInputs) -> Tensor:
         """One vector a window [R, C]; computed once, whatever the number of hypotheses and steps."""
         parts = [self.encoder(inputs.rows, inputs.is_observed), inputs.summary, self._read(inputs.pieces.last[:, None])[:, 0]]
         if self.config.trackers:

@@ -1,4 +1,4 @@
-"""How a scene model states windows and tracks: what its network is told, and a track as displacements from the last detection.
+"""How a place model states windows and tracks: what its network is told, and a track as displacements from the last detection.
 
 The stretch from the last detection to now is cut into a fixed number of equal pieces, however long ago the detection was; the
 future into pieces of equal length. So a track begins exactly at the detection, and a piece of length one is one at unit speed.
@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from cadence.arrays import Int64s
-from cadence.network.scene import Pieces, SceneInputs, SceneNetwork, SceneNetworkConfig, octaves
+from cadence.network.place import Pieces, PlaceInputs, PlaceNetwork, PlaceNetworkConfig, octaves
 from cadence.recordings import NUM_STEPS, Recordings
 from cadence.types import Context, Detections, WindowBatch
 
@@ -27,7 +27,7 @@ NUM_TRACKER = 4 * len(_TRACKER_LAGS) + 3
 
 
 @dataclass(frozen=True)
-class SceneConfig:
+class PlaceConfig:
     """What belongs to a checkpoint: the network, and what its numbers mean.
 
     network      its sizes and inputs
@@ -43,7 +43,7 @@ class SceneConfig:
                  them to where its agent is now within so many steps
     """
 
-    network: SceneNetworkConfig = field(default_factory=SceneNetworkConfig)
+    network: PlaceNetworkConfig = field(default_factory=PlaceNetworkConfig)
     step_s: float = 60.0
     centre_m: tuple[float, float] = (25494.0, 25494.0)
     scale_m: float = 25494.0
@@ -70,16 +70,16 @@ class SceneConfig:
         """Pieces of a track."""
         return self.num_gap + self.num_future
 
-    def build(self) -> SceneNetwork:
+    def build(self) -> PlaceNetwork:
         """The untrained network."""
-        return SceneNetwork(self.network, NUM_ROW, NUM_SUMMARY, NUM_TRACKER)
+        return PlaceNetwork(self.network, NUM_ROW, NUM_SUMMARY, NUM_TRACKER)
 
 
-def scene_inputs(windows: WindowBatch, config: SceneConfig) -> SceneInputs:
+def place_inputs(windows: WindowBatch, config: PlaceConfig) -> PlaceInputs:
     """What the network is told of windows with one agent each, all with at least one detection [R = B]."""
-    context = windows.required_context("scene_inputs")
+    context = windows.required_context("place_inputs")
     if windows.num_agents != 1 or not bool(windows.is_active.all()):
-        raise ValueError("scene_inputs: windows of one agent with at least one detection each are needed")
+        raise ValueError("place_inputs: windows of one agent with at least one detection each are needed")
     seen = _Seen(windows.detections, context, config)
     goal, is_goal = _goal(context, config, seen.last)
     elapsed = seen.age[:, :1] if context.elapsed_s is None else (context.elapsed_s.float() / config.step_s)[:, None]
@@ -89,13 +89,13 @@ def scene_inputs(windows: WindowBatch, config: SceneConfig) -> SceneInputs:
     summary = [*seen.summary(elapsed), is_goal, goal, last, octaves(goal, _NUM_OCTAVES) * is_goal]
     gap = torch.full_like(seen.last_age, config.shared_gap_steps) if config.shared_gap_steps else seen.last_age
     pieces = _pieces(seen.last, gap, config)
-    return SceneInputs(rows, is_observed, torch.cat(summary, dim=-1), trackers, is_tracker, pieces)
+    return PlaceInputs(rows, is_observed, torch.cat(summary, dim=-1), trackers, is_tracker, pieces)
 
 
 class _Seen:
     """The detections of R windows in the network's units: age [R, N] in steps, place [R, N, 2], count [R]."""
 
-    def __init__(self, detections: Detections, context: Context, config: SceneConfig) -> None:
+    def __init__(self, detections: Detections, context: Context, config: PlaceConfig) -> None:
         centre = torch.tensor(config.centre_m, dtype=torch.float64)
         self.unit = config.unit_step_m / config.scale_m
         self.places = config.network.places
@@ -157,7 +157,7 @@ def _thinned(count: Tensor, keep: int) -> tuple[Tensor, Tensor]:
     return index.minimum(count[:, None] - 1), index < count[:, None]
 
 
-def _goal(context: Context, config: SceneConfig, last: Tensor) -> tuple[Tensor, Tensor]:
+def _goal(context: Context, config: PlaceConfig, last: Tensor) -> tuple[Tensor, Tensor]:
     """The known goal [R, 2], zero where there is none, and whether there is one [R, 1]; relative ones about `last` [R, 2]."""
     size = len(context.datum_m)
     if context.known_goal_m is None or not config.network.known_goal:
@@ -169,7 +169,7 @@ def _goal(context: Context, config: SceneConfig, last: Tensor) -> tuple[Tensor, 
     return torch.where(is_goal, place, 0.0).float(), is_goal.float()
 
 
-def _trackers(context: Context, config: SceneConfig, last: Tensor) -> tuple[Tensor, Tensor]:
+def _trackers(context: Context, config: PlaceConfig, last: Tensor) -> tuple[Tensor, Tensor]:
     """Where the trackers were, about the last detection and on the map [R, M, G], and which are there [R, M]."""
     if context.tracker_m is None or not config.network.trackers or not context.tracker_m.shape[2]:
         return torch.zeros(len(last), 1, NUM_TRACKER), torch.zeros(len(last), 1)
@@ -185,7 +185,7 @@ def _trackers(context: Context, config: SceneConfig, last: Tensor) -> tuple[Tens
     return torch.cat(features, dim=-1), is_there[:, :, 0, 0].float()
 
 
-def _pieces(last: Tensor, last_age: Tensor, config: SceneConfig) -> Pieces:
+def _pieces(last: Tensor, last_age: Tensor, config: PlaceConfig) -> Pieces:
     gap = (last_age / config.num_gap).expand(-1, config.num_gap)
     future = torch.arange(config.num_future, dtype=last.dtype).expand(len(last), -1) * config.stride
     start = torch.cat([gap * torch.arange(config.num_gap) - last_age, future], dim=1)
@@ -207,19 +207,19 @@ def recorded_track(recordings: Recordings, row: Int64s, episode: Int64s, pieces:
     return torch.from_numpy(place[before] * (1.0 - share) + place[np.minimum(before + 1, last)] * share)
 
 
-def to_pieces(track_m: Tensor, pieces: Pieces, config: SceneConfig) -> Tensor:
+def to_pieces(track_m: Tensor, pieces: Pieces, config: PlaceConfig) -> Tensor:
     """Tracks [R, ..., P + 1, 2] in metres through the ends of all pieces as displacements [R, ..., P, 2] at unit speed."""
     span_m = _over(pieces.span * config.scale_m, track_m)
     return torch.where(span_m > 0, track_m.diff(dim=-2) / span_m.clamp_min(1e-6), 0.0).float()
 
 
-def to_track(displacement: Tensor, pieces: Pieces, config: SceneConfig) -> Tensor:
+def to_track(displacement: Tensor, pieces: Pieces, config: PlaceConfig) -> Tensor:
     """Displacements [R, ..., P, 2] as tracks [R, ..., P + 1, 2] in metres from the last detection, which comes first."""
     ends = (displacement * _over(pieces.span * config.scale_m, displacement)).cumsum(dim=-2)
     return torch.nn.functional.pad(ends, (0, 0, 1, 0))
 
 
-def future_of(track: Tensor, config: SceneConfig) -> Tensor:
+def future_of(track: Tensor, config: PlaceConfig) -> Tensor:
     """Positions [..., T, 2] at now and the steps after it, of tracks [..., P + 1, 2]; straight within a piece."""
     ends = track[..., config.num_gap :, :]
     at = torch.arange(NUM_STEPS) / config.stride
