@@ -19,7 +19,7 @@ from pipeline.stores.urls import masked
 
 EXIT_INTERRUPTED = 130
 _COMBINED = ["export.combined=true"]
-_STRICT = ["extract.is_strict=true"]
+_STRICT = ["extract.is_strict=true", "infer.is_strict=true"]
 
 app = typer.Typer(
     name="cadence",
@@ -64,7 +64,7 @@ Set = Annotated[
     list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="One setting, as in infer.num_hypotheses=50; repeatable.")
 ]
 Combined = Annotated[bool, typer.Option("--combined", help="Also write one file that holds the log and the results.")]
-Strict = Annotated[bool, typer.Option("--strict", help="Refuse logs of which something is suspected: extract.is_strict.")]
+Strict = Annotated[bool, typer.Option("--strict", help="Refuse logs of which something is suspected: is_strict of a stage.")]
 Force = Annotated[bool, typer.Option("--force", help="Do it again even where nothing has changed.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress on stderr; errors only.")]
 Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON on stdout.")]
@@ -204,16 +204,18 @@ def extract(
     from pipeline.extract.config import ExtractConfig
     from pipeline.extract.stage import extract as stage
 
-    resolved = stage_config(ExtractConfig, "extract", config, [*(settings or ()), *_STRICT * strict], seed)
+    resolved = stage_config(ExtractConfig, "extract", config, [*(settings or ()), *_STRICT[:1] * strict], seed)
     return _show(stage(mission, resolved, Progress(quiet), force), as_json)
 
 
 @app.command()
 def infer(
-    mission: Mission, config: Config = None, settings: Set = None, seed: Seed = None, force: Force = False,
-    quiet: Quiet = False, as_json: Json = False,
-) -> None:  # fmt: skip
+    mission: Mission, strict: Strict = False, config: Config = None, settings: Set = None, seed: Seed = None,
+    force: Force = False, quiet: Quiet = False, as_json: Json = False,
+) -> int:  # fmt: skip
     """Stage 3: draw weighted hypotheses, past and future.
+
+    Exit code 8 where the checkpoint does not fit the log, so that the default one took its place.
 
     \b
     Example:
@@ -222,7 +224,8 @@ def infer(
     from pipeline.infer.config import InferConfig
     from pipeline.infer.stage import infer as stage
 
-    _show(stage(mission, stage_config(InferConfig, "infer", config, settings or (), seed), Progress(quiet), force), as_json)
+    resolved = stage_config(InferConfig, "infer", config, [*(settings or ()), *_STRICT[1:] * strict], seed)
+    return _show(stage(mission, resolved, Progress(quiet), force), as_json)
 
 
 @app.command()

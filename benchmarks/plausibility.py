@@ -20,11 +20,11 @@ from rosbags.typesys import Stores, get_typestore
 from benchmarks import publishing
 from benchmarks.mixed_logs import START_NS, write_mixed_log
 from benchmarks.publishing import Measurement
-from pipeline.extract.plausibility import Kind
 from pipeline.extract.stage import ExtractConfig, write_tables
 from pipeline.logs.reader import open_log
 from pipeline.mapping.sources import SourceConfig
 from pipeline.progress import Progress
+from pipeline.suspicions import Kind
 
 SIZE_MB = 100.0
 NUM_POSITIONS = 200_000

@@ -61,13 +61,7 @@ def scores_in_hindsight(position_m: Tensor, windows: WindowBatch, shown_later: D
         windows: what they were drawn from.
         shown_later: the detections to compare with.
     """
-    is_used = _is_used(windows, shown_later)
-    position = position_m.nan_to_num()
-    at = ((shown_later.time_s - windows.time_s[0]) / windows.step_s).clamp(0, windows.num_steps - 1.001)
-    before = at.floor().long()
-    share = (at - before)[:, None, :, :, None]
-    pick = before[:, None, :, :, None].expand(-1, NUM_SAMPLES, -1, -1, 2)
-    foreseen = (1.0 - share) * position.gather(3, pick) + share * position.gather(3, pick + 1)
+    foreseen, is_used = at_detections(position_m, windows, shown_later)
     error = (foreseen - shown_later.position_m[:, None]).norm(dim=-1).mean(1)
     # half of the samples against the other half: an unbiased estimate of the mean distance between two of them
     half = NUM_SAMPLES // 2
@@ -77,6 +71,17 @@ def scores_in_hindsight(position_m: Tensor, windows: WindowBatch, shown_later: D
     scale = torch.where(known, distance_s, torch.inf).amin(-1).clamp_min(windows.step_s)
     score = torch.where(is_used, (error - 0.5 * spread) / scale, 0.0).sum(-1) / is_used.sum(-1).clamp_min(1)
     return score[is_used.any(-1)]
+
+
+def at_detections(position_m: Tensor, windows: WindowBatch, shown_later: Detections) -> tuple[Tensor, Tensor]:
+    """Hypotheses [B, K, A, T, 2] at the times of detections [B, A, N]: positions [B, K, A, N, 2], and which can be compared."""
+    position = position_m.nan_to_num()
+    at = ((shown_later.time_s - windows.time_s[0]) / windows.step_s).clamp(0, windows.num_steps - 1.001)
+    before = at.floor().long()
+    share = (at - before)[:, None, :, :, None]
+    pick = before[:, None, :, :, None].expand(-1, position.shape[1], -1, -1, 2)
+    foreseen = (1.0 - share) * position.gather(3, pick) + share * position.gather(3, pick + 1)
+    return foreseen, _is_used(windows, shown_later)
 
 
 def withhold(windows: WindowBatch, seed: int) -> tuple[WindowBatch, Detections]:

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
 from cadence.errors import CadenceError, ImplausibleInputError, NothingDetectedError, PartialInputError
-from pipeline.extract.plausibility import suspicions_in
 from pipeline.manifest import StageResult
 from pipeline.stores.urls import shown
+from pipeline.suspicions import suspicions_in
 
 if TYPE_CHECKING:  # the configurations of the stages bring torch with them, and the command line shows outcomes
     from pipeline.batch.config import RunConfig

@@ -8,10 +8,10 @@ from typing import Any, get_args
 
 from cadence.errors import ImplausibleInputError, PartialInputError
 from pipeline.batch.outcome import LogOutcome, Status
-from pipeline.extract.plausibility import few, suspicions_in
 from pipeline.manifest import StageResult
 from pipeline.score_words import METRICS, estimator_words, value_words
 from pipeline.stores.urls import shown
+from pipeline.suspicions import few, suspicions_in
 
 SHOWN_STAGES = ("export", "report")
 """Whose files a person wants to open; the others are intermediate."""

@@ -37,10 +37,17 @@ class FittingData:
 
     @functools.cached_property
     def hindsight_windows(self) -> tuple[WindowBatch, Detections]:
-        """Evenly spread windows in which something was detected before the origin and after it, and what was after it."""
+        """What the choices by hindsight are made on: see `later_known`."""
+        return self.later_known(_HINDSIGHT_ROWS)
+
+    def later_known(self, num_rows: int) -> tuple[WindowBatch, Detections]:
+        """Evenly spread windows in which something was detected before the origin and after it, and what was after it.
+
+        They hold about `num_rows` tracks.
+        """
         later = later_detections(self.detections, self.grid, self.windows, self.default_sigma_m)
         useful = (self.windows.batch.is_active & later.is_observed.any(-1)).sum(1)
         order = torch.nonzero(useful)[:, 0]
-        num = max(1, int(_HINDSIGHT_ROWS / float(useful[order].double().mean()))) if len(order) else 0
+        num = max(1, int(num_rows / float(useful[order].double().mean()))) if len(order) else 0
         chosen = order[torch.linspace(0, len(order) - 1, min(num, len(order))).round().long()]
         return self.windows.batch[chosen], later[chosen]

@@ -42,7 +42,8 @@ class Preset:
 
 
 READ_BY_ALL = (
-    "checkpoint", "num_hypotheses", "seed", "device", "default_sigma_m", "is_associated", "association.", "grid.stride_steps",
+    "checkpoint", "num_hypotheses", "seed", "device", "default_sigma_m", "is_strict", "is_associated", "association.",
+    "grid.stride_steps",
 )  # fmt: skip
 """Settings of [infer] that act whatever the preset."""
 
@@ -50,8 +51,8 @@ _BANK = ("grid.", "guidance.")
 
 PRESETS: Mapping[str, Preset] = {
     "general": Preset(load_general, ("sampler", "num_steps", "is_gated", *_BANK), ("cpu", "cuda"), forecasts=False),
-    "place": Preset(load_place, ("place.", "guidance.")),
-    "paper": Preset(load_paper, ("paper.",)),
+    "place": Preset(load_place, ("is_tested", "place.", "guidance.")),
+    "paper": Preset(load_paper, ("is_tested", "paper.")),
     **dict.fromkeys(RIVALS, Preset(load_mixture, infers=False)),
 }
 

@@ -5,10 +5,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from pipeline.extract.obstacle_sources import ObstacleSources
-from pipeline.extract.plausibility import Kind
 from pipeline.extract.stamps import moment_ns
 from pipeline.extract.thinning import ThinningConfig
 from pipeline.mapping.sources import SourceConfig
+from pipeline.suspicions import LogKind
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class ExtractConfig:
     max_speed_mps: float | None = 1000.0
     datum: tuple[float, float] | None = None
     obstacles: ObstacleSources = field(default_factory=ObstacleSources)
-    trusted: tuple[Kind, ...] = ()
+    trusted: tuple[LogKind, ...] = ()
     is_strict: bool = False
 
     def __post_init__(self) -> None:

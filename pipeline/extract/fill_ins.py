@@ -5,8 +5,8 @@ from typing import Final
 import numpy as np
 
 from pipeline.arrays import Bools
-from pipeline.extract.plausibility import Suspicions
 from pipeline.extract.positions import Positions, numbered
+from pipeline.suspicions import Suspicions
 
 _FILL_INS: Final = ((0, 0), (-1, -1), (90, 180), (-90, -180), (180, 180), (999, 999), (9999, 9999), (99999, 99999))
 _DEGREE_M: Final = 111_000.0

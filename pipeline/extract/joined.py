@@ -5,12 +5,12 @@ from collections.abc import Callable
 from typing import Final
 
 from cadence.errors import InputError
-from pipeline.extract.plausibility import Suspicions
 from pipeline.extract.positions import Positions
 from pipeline.extract.transform_messages import LogTransforms
 from pipeline.extract.transforms import TransformTree
 from pipeline.logs.parts import missing_parts, recorded_parts
 from pipeline.logs.reader import MissionLog
+from pipeline.suspicions import Suspicions
 
 _FIXED_WORDS: Final = {
     "map", "odom", "world", "mission", "enu", "ned", "local", "origin", "fixed", "global", "utm", "earth", "ecef", "wgs84",

@@ -11,9 +11,9 @@ import numpy as np
 
 from pipeline.arrays import Bools, Int64s
 from pipeline.extract.clocks import MIN_ROWS, Clock, Judgement, Stamps, judge, strays
-from pipeline.extract.plausibility import Suspicions
 from pipeline.extract.positions import ChannelReader, Positions
 from pipeline.mapping.sources import LOG_TIME, PUBLISH_TIME
+from pipeline.suspicions import Suspicions
 
 TRUSTED = 'extract.trusted = ["time"]'
 

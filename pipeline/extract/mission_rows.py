@@ -15,7 +15,6 @@ from pipeline.extract.joined import check_joined
 from pipeline.extract.mission_clock import on_one_clock
 from pipeline.extract.names import Naming, without_false_names
 from pipeline.extract.placement import Placing, bring_together, in_enu, mission_frame, place
-from pipeline.extract.plausibility import Suspicions, few
 from pipeline.extract.positions import ChannelReader, Positions, Rows
 from pipeline.extract.reuse import without_reused_names
 from pipeline.extract.selection import ROLES
@@ -27,6 +26,7 @@ from pipeline.extract.transform_messages import LogTransforms
 from pipeline.extract.transforms import Limits
 from pipeline.extract.units import in_true_units
 from pipeline.logs.reader import MissionLog
+from pipeline.suspicions import Suspicions, few
 from pipeline.tables import Frame
 
 

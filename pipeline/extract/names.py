@@ -13,8 +13,8 @@ from scipy.spatial import cKDTree
 
 from pipeline.arrays import Bools, Int64s
 from pipeline.extract.covariances import are_apart
-from pipeline.extract.plausibility import Suspicions, listed
 from pipeline.extract.positions import Positions
+from pipeline.suspicions import Suspicions, listed
 
 _MAX_SHARED: Final = 0.05
 """Of the messages that hold a name: with more in which it stands at several places it is no name at all; with fewer the odd

@@ -12,9 +12,9 @@ import numpy as np
 
 from pipeline.arrays import Int64s, Objects
 from pipeline.extract.names import Naming
-from pipeline.extract.plausibility import Suspicions, listed
 from pipeline.extract.positions import Names, Positions
 from pipeline.extract.tracks import Jump, Track, apart_m, odd_share, pieces_of
+from pipeline.suspicions import Suspicions, listed
 
 _MAX_ODD: Final = 0.3
 """Of the steps of a name: noise alone makes a target seem to leave and come back in one step of twelve."""

@@ -12,8 +12,8 @@ from typing import Final
 import numpy as np
 
 from pipeline.arrays import Float64s, Int64s
-from pipeline.extract.plausibility import Suspicions
 from pipeline.extract.positions import Positions, numbered
+from pipeline.suspicions import Suspicions
 
 _NEIGHBOURS: Final = (-2, -1, 1, 2)
 _MAX_GAPS: Final = 3.0

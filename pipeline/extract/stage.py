@@ -17,7 +17,6 @@ from pipeline.extract.collapse import Collapsed, collapse
 from pipeline.extract.config import ExtractConfig
 from pipeline.extract.mission_rows import rows_in_frame
 from pipeline.extract.obstacle_sources import collect_obstacles
-from pipeline.extract.plausibility import Suspicions, few
 from pipeline.extract.positions import ChannelReader, Positions
 from pipeline.extract.reading import read_positions
 from pipeline.extract.scatter import with_scatter
@@ -31,6 +30,7 @@ from pipeline.manifest import StageResult, run_stage
 from pipeline.missions import CATALOGUE_NAME
 from pipeline.obstacle_file import OBSTACLES_NAME, write_obstacles
 from pipeline.progress import Progress
+from pipeline.suspicions import Suspicions, few
 from pipeline.tables import write_table
 from schemas.tables import POSES, TRUTH
 

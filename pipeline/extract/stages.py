@@ -11,9 +11,9 @@ from typing import Final
 import numpy as np
 from scipy.spatial import cKDTree
 
-from pipeline.extract.plausibility import Suspicions
 from pipeline.extract.positions import Positions
 from pipeline.mapping.topic_names import family_of, words_of
+from pipeline.suspicions import Suspicions
 
 _COINCIDE: Final = 0.7
 """Of the positions of the channel that has fewer. A tracker confirms late and drops some; what is independent coincides by

@@ -8,9 +8,9 @@ import numpy as np
 
 from pipeline.arrays import Int64s
 from pipeline.extract.mission_clock import TRUSTED
-from pipeline.extract.plausibility import Suspicions
 from pipeline.extract.positions import ChannelReader, Positions
 from pipeline.logs.health import utc
+from pipeline.suspicions import Suspicions
 
 _MIN_GAP_S: Final = 86400.0
 _GAP_FACTOR: Final = 100.0

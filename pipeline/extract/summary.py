@@ -6,12 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.extract.plausibility import Suspicions, few
 from pipeline.extract.positions import ChannelReader, Positions
 from pipeline.extract.selection import ROLES
 from pipeline.logs.reader import MissionLog
 from pipeline.mapping.message_types import MESSAGE_TYPES, type_of_schema
 from pipeline.progress import Progress
+from pipeline.suspicions import Suspicions, few
 from pipeline.tables import Frame
 
 _STAMPS_APART_S = 3600.0

@@ -13,10 +13,10 @@ import numpy as np
 from cadence.errors import ConfigError
 from pipeline.arrays import Bools, Float64s
 from pipeline.extract.covariances import rotated
-from pipeline.extract.plausibility import Suspicions
 from pipeline.extract.positions import Positions, numbered
 from pipeline.frames import from_earth_centred
 from pipeline.mapping.sources import SourceConfig, Unit
+from pipeline.suspicions import Suspicions
 
 EARTH_CENTRED: Final = {"earth", "ecef"}
 """Frames that REP 105 and receivers have at the centre of the earth: their x and y are no plane."""

@@ -28,6 +28,9 @@ class InferConfig:
                      read
     is_gated         of the general preset: the network moves all, half or none of the hypotheses, as withheld detections of
                      this log advise
+    is_tested        a checkpoint that adapts to no log is tested on later detections of this one; where it does not fit,
+                     hypotheses are drawn with the default checkpoint instead
+    is_strict        refuse a log that the checkpoint does not fit (`--strict`)
     is_associated    detections of unknown origin are told apart; otherwise they are taken for one agent called "unknown"
     association      how they are told apart
     """
@@ -40,6 +43,8 @@ class InferConfig:
     default_sigma_m: float = 0.0
     device: str = "auto"
     is_gated: bool = True
+    is_tested: bool = True
+    is_strict: bool = False
     is_associated: bool = True
     association: AssociationConfig = field(default_factory=AssociationConfig)
     grid: GridConfig = field(default_factory=GridConfig)

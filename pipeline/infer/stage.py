@@ -1,7 +1,7 @@
 """Infer: detections → hypotheses: the model fitted to the log, all windows batched, constraints kept."""
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -9,9 +9,11 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from cadence.constraints.obstacles import Obstacles
+from cadence.errors import ImplausibleInputError
 from pipeline.associations import Sources, WayWindows, build_way_windows, tell_sources
 from pipeline.catalogue import read_catalogue
-from pipeline.checkpoints import checkpoint_hash, read_info
+from pipeline.checkpoints import DEFAULT, checkpoint_hash, read_info
+from pipeline.estimators.fit_test import FitTest, fit_test
 from pipeline.estimators.fitting import FittingData
 from pipeline.estimators.loaded import Loaded
 from pipeline.estimators.presets import find_weights, load_estimator, refuse_unread
@@ -22,6 +24,7 @@ from pipeline.manifest import StageResult, run_stage
 from pipeline.missions import CATALOGUE_NAME
 from pipeline.obstacle_file import OBSTACLES_NAME, read_obstacles
 from pipeline.progress import Progress
+from pipeline.suspicions import Suspicions
 from pipeline.tables import Frame, read_table, write_table
 from pipeline.windows import MissionWindows, build_windows
 
@@ -29,7 +32,8 @@ from pipeline.windows import MissionWindows, build_windows
 def infer(directory: Path, config: InferConfig, progress: Progress, force: bool = False) -> StageResult:
     """Draw hypotheses for every window of the mission in `directory`: hypotheses.parquet and windows.parquet.
 
-    Where detections of unknown origin were told apart, associations.parquet and labels.parquet hold how.
+    Where detections of unknown origin were told apart, associations.parquet and labels.parquet hold how. A checkpoint that the
+    log shows not to fit is not used but suspected; `ImplausibleInputError` where `config.is_strict`.
     """
     weights = find_weights(config.checkpoint)
     inputs = [directory / "detections.parquet", directory / OBSTACLES_NAME]
@@ -42,6 +46,8 @@ def infer(directory: Path, config: InferConfig, progress: Progress, force: bool 
 
     def body(folder: Path) -> dict[str, Any]:
         plan = _Plan.of(config, detections, read_obstacles(inputs[1]), start_ns)
+        for line in plan.suspicions.lines():
+            progress.note(f"infer: suspected {line}")
         summary = _draw(plan, str(detections["log_id"][0]), folder, frame, progress)
         if plan.seen.sources.association is not None:
             found = plan.seen.sources.association.rows(detections)
@@ -52,15 +58,21 @@ def infer(directory: Path, config: InferConfig, progress: Progress, force: bool 
             **summary,
             "step_s": plan.seen.sources.grid.step_s,
             "context_steps": plan.seen.sources.grid.context_steps,
-            "checkpoint": config.checkpoint,
-            "checkpoint_sha256": None if weights is None else checkpoint_hash(weights),
+            "checkpoint": plan.checkpoint,
+            "checkpoint_sha256": _hash(plan.checkpoint),
             "seed": config.seed,
             **plan.about,
+            "suspicions": plan.suspicions.records(),
         }
 
     # the catalogue itself is no input: it names the place of the log, and a log that was moved is not inferred again
     facts = {"start_ns": start_ns}
     return run_stage("infer", directory, config=config, inputs=inputs, body=body, force=force, facts=facts)
+
+
+def _hash(checkpoint: str) -> str | None:
+    weights = find_weights(checkpoint)
+    return None if weights is None else checkpoint_hash(weights)
 
 
 def _mission_start_ns(directory: Path, detections: pa.Table) -> int:
@@ -128,25 +140,46 @@ class _Seen:
 class _Plan:
     """What is to be drawn: the windows, the draws as they come, and what the summary says of the model."""
 
+    checkpoint: str
     seen: _Seen
     draws: Iterator[Drawn]
     about: Mapping[str, Any]
+    suspicions: Suspicions
 
     @staticmethod
     def of(config: InferConfig, detections: pa.Table, obstacles: Obstacles, start_ns: int) -> "_Plan":
-        """The draws of a log by the checkpoint, which decides the grid as well."""
+        """The draws of a log by the checkpoint, which decides the grid as well, or by the default one where it does not fit."""
         loaded = load_estimator(config.checkpoint, config.samplings)
         seen = _Seen.of(config, detections, loaded)
-        fitted = loaded.fitted(FittingData.of(seen.sources.named, seen.sources.grid, seen.named, config.default_sigma_m))
+        data = FittingData.of(seen.sources.named, seen.sources.grid, seen.named, config.default_sigma_m)
+        suspicions, about = Suspicions(), seen.about()
+        if config.is_tested and loaded.fit is None:
+            test = fit_test(loaded.estimator, data, seen.named.located(start_ns, obstacles))
+            if test is not None and test.is_misfit:
+                _suspect(test, config, suspicions)
+                plan = _Plan.of(replace(config, checkpoint=DEFAULT), detections, obstacles, start_ns)
+                return replace(plan, suspicions=suspicions, about={**plan.about, "fit_test": asdict(test)})
+            about["fit_test"] = None if test is None else asdict(test)
+        fitted = loaded.fitted(data)
         estimator, num = fitted.estimator, config.num_hypotheses
         if seen.ways is None:
             draws = draw_windows(estimator, seen.named.located(start_ns, obstacles), num, loaded.is_apart)
         else:
             ways = seen.ways.located(start_ns, obstacles)
             draws = (draw_tracks if loaded.is_apart else draw_ways)(estimator, ways, num)
-        return _Plan(seen, draws, {**fitted.about, **seen.about()})
+        return _Plan(config.checkpoint, seen, draws, {**fitted.about, **about}, suspicions)
 
     @property
     def windows(self) -> MissionWindows:
         """What the tables speak of."""
         return self.seen.named if self.seen.ways is None else self.seen.ways.windows
+
+
+def _suspect(test: FitTest, config: InferConfig, suspicions: Suspicions) -> None:
+    """Say that the checkpoint is of another place; `ImplausibleInputError` where that is to be refused."""
+    suspicions.add(
+        "checkpoint", config.checkpoint, seen=f"it does not fit this log: {test}",
+        done=f"hypotheses are drawn with {DEFAULT!r} instead", setting="infer.is_tested = false",
+    )  # fmt: skip
+    if config.is_strict:
+        raise ImplausibleInputError(f"infer: refused by --strict, as something is suspected: {suspicions.lines()[0]}")

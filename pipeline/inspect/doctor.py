@@ -8,7 +8,6 @@ from typing import Any, Literal
 
 from cadence.errors import CadenceError, ImplausibleInputError, InputError, PartialInputError, UsageError
 from pipeline.extract.config import ExtractConfig
-from pipeline.extract.plausibility import few, suspicions_in
 from pipeline.extract.stage import write_tables
 from pipeline.ingest.stage import survey_channels
 from pipeline.inspect.log_times import time_remarks
@@ -18,6 +17,7 @@ from pipeline.logs.reader import MissionLog, open_parts
 from pipeline.missions import find_missions
 from pipeline.progress import Progress
 from pipeline.stores.urls import is_url
+from pipeline.suspicions import few, suspicions_in
 
 Verdict = Literal["sound", "faulty", "partial", "unusable"]
 _MEANING: Mapping[Verdict, str] = {

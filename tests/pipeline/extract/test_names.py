@@ -5,8 +5,8 @@ import pytest
 from fixtures.detection_rows import rows
 
 from pipeline.extract.names import Naming, without_false_names
-from pipeline.extract.plausibility import Suspicions
 from pipeline.extract.positions import Positions
+from pipeline.suspicions import Suspicions
 
 Item = tuple[int, float, float, float, str | None]
 

@@ -7,10 +7,10 @@ import pytest
 from fixtures.detection_rows import rows, together
 
 from pipeline.extract.names import Naming
-from pipeline.extract.plausibility import Suspicions
 from pipeline.extract.positions import Positions
 from pipeline.extract.reuse import without_reused_names
 from pipeline.extract.tracks import Track, odd_share, pieces_of
+from pipeline.suspicions import Suspicions
 
 Floats = np.ndarray[Any, np.dtype[np.float64]]
 

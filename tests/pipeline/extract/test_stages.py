@@ -5,9 +5,9 @@ from typing import Any
 import numpy as np
 from fixtures.detection_rows import rows, together
 
-from pipeline.extract.plausibility import Suspicions
 from pipeline.extract.positions import Positions
 from pipeline.extract.stages import without_other_stages
+from pipeline.suspicions import Suspicions
 
 NAN = float("nan")
 

@@ -9,9 +9,12 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Final, Literal
 
-Kind = Literal["identity", "time", "place", "covariance", "duplication", "stage"]
+LogKind = Literal["identity", "time", "place", "covariance", "duplication", "stage"]
 """identity: who was seen; time: when; place: where, in which frame and unit; covariance: how accurately; duplication: the same
 thing counted twice; stage: what a channel holds (detections, or a step of work on them)."""
+
+Kind = LogKind | Literal["checkpoint"]
+"""checkpoint: what hypotheses were to be drawn with (`pipeline.estimators.fit_test`)."""
 
 _MAX_SHOWN: Final = 10
 _MAX_LISTED: Final = 3
@@ -40,7 +43,7 @@ class Suspicion:
 class Suspicions:
     """The suspicions of one log as they are found. Kinds that the user trusts are not looked for."""
 
-    def __init__(self, trusted: Iterable[Kind] = ()) -> None:
+    def __init__(self, trusted: Iterable[LogKind] = ()) -> None:
         self._trusted = frozenset(trusted)
         self._found: dict[Suspicion, None] = {}
 

@@ -9,11 +9,11 @@ from fixtures.small_logs import Row, stamp, write_log
 from cadence.errors import ImplausibleInputError
 from cli import main
 from pipeline.extract.config import ExtractConfig
-from pipeline.extract.plausibility import Suspicion, Suspicions, few, suspicions_in
 from pipeline.extract.stage import extract
 from pipeline.ingest.stage import IngestConfig, ingest
 from pipeline.inspect.doctor import diagnose, exit_code, render
 from pipeline.progress import Progress
+from pipeline.suspicions import Suspicion, Suspicions, few, suspicions_in
 
 QUIET = Progress(quiet=True)
 TINY = [
