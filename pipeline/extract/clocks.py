@@ -28,6 +28,9 @@ _STANDING: Final = 0.3
 good reasons, but follow each other in a small part of the time between two scans."""
 _STANDING_STEPS: Final = 3.0
 """Of the usual steps of the stamps: for longer a clock that works does not stand."""
+_SLOW: Final = 100
+"""Within a second log times go on by so many times the step of a stamp that as good as stands: its nanoseconds hold micro- or
+milliseconds."""
 _UNITS: Final = (3, 6, 9)
 _UNIT_TOLERANCE: Final = 0.01
 _PACES: Final = (0.1, 10.0)
@@ -133,9 +136,11 @@ def judge(stamps: Stamps) -> Judgement:
 
 def _are_prompt(stamps: Stamps) -> bool:
     """Whether all is as it is in nearly every log: stamps go on, a little behind the log times."""
-    ahead_ns, goes_on = stamps.time_ns - stamps.log_time_ns, np.diff(stamps.log_time_ns) > 0
-    is_near = stamps.time_ns.min() >= 0 and ahead_ns.min() >= -LATE_S * 1e9 and ahead_ns.max() <= AHEAD_S * 1e9
-    return bool(is_near and not ((np.diff(stamps.time_ns) == 0) & goes_on).any())
+    ahead_ns = stamps.time_ns - stamps.log_time_ns
+    if not (stamps.time_ns.min() >= 0 and ahead_ns.min() >= -LATE_S * 1e9 and ahead_ns.max() <= AHEAD_S * 1e9):
+        return False
+    step_s, log_s = np.diff(stamps.time_ns) * 1e-9, np.diff(stamps.log_time_ns) * 1e-9
+    return not bool((_stays(step_s, log_s) & (log_s > 0)).any())
 
 
 def strays(stamps: Stamps, clock: Clock) -> Bools:
@@ -159,6 +164,11 @@ def _unset(stamps: Stamps) -> Bools:
     return np.asarray(found & is_elsewhere)
 
 
+def _stays(step_s: Float64s, log_s: Float64s) -> Bools:
+    """Which steps of the stamps [N] are none, beside those of the log."""
+    return np.asarray((step_s == 0) | ((_SLOW * np.abs(step_s) <= log_s) & (log_s <= 1)))
+
+
 def _standing(stamps: Stamps) -> tuple[Bools, str]:
     """Which stamps [N] stand still while the log goes on and what they stamp moves, and the fault in words.
 
@@ -171,7 +181,7 @@ def _standing(stamps: Stamps) -> tuple[Bools, str]:
         is_next = who[order][1:] == who[order][:-1]
     step_s = np.diff(stamps.time_ns[order]).astype(np.float64) * 1e-9
     log_s = np.diff(stamps.log_time_ns[order]).astype(np.float64) * 1e-9 * is_next
-    stays = is_next & (step_s == 0)
+    stays = is_next & _stays(step_s, log_s)
     moves = stays & (log_s > 0) & (np.diff(stamps.place[order], axis=0) != 0).any(axis=1)
     found = np.zeros(len(stamps), np.bool_)
     if not moves.any():

@@ -72,9 +72,10 @@ def test_frozen_and_coarse_stamps_give_way_to_the_log(tmp_path: Path) -> None:
     assert found.summary["span_s"] == pytest.approx(29.0) and suspected(found) == [
         "time /target/detections: 30 times are those of the log"
     ]
-    coarse = [row("/contacts/A", i / 10, START_NS + i // 10 * S, 2.0 * i) for i in range(300)]
-    found = run(tmp_path, coarse)
-    assert seconds(found) == [i / 10 for i in range(300)] and len(suspected(found)) == 1
+    for unit in (0, 1, 1000):  # only seconds, and nanoseconds that hold milli- or microseconds
+        coarse = [row("/contacts/A", i / 10, START_NS + i // 10 * S + i % 10 * 100 * unit, 2.0 * i) for i in range(300)]
+        found = run(tmp_path, coarse)
+        assert seconds(found) == [i / 10 for i in range(300)] and len(suspected(found)) == 1
 
 
 def test_unset_stamps_are_of_the_clock_of_the_others(tmp_path: Path) -> None:
@@ -121,6 +122,32 @@ def test_a_clock_that_is_set_back_leaves_two_parts(tmp_path: Path) -> None:
         found = run(tmp_path, [*shifted(rows[:10], back_s), *rows[10:]])
         assert seconds(found) == [float(i) for i in range(10, 40)]
         assert suspected(found) == ["time /contacts/A: only 30 positions between two steps are used, 10 are left out"]
+
+
+@pytest.mark.parametrize("ahead_s", [60.0, 3600.0, 5 * DAY_S])
+def test_a_clock_that_is_set_forward_leaves_two_parts(ahead_s: float, tmp_path: Path) -> None:
+    """Of two targets, which are where one more second takes them when an hour has passed."""
+    both = sorted([*contacts("A", num=40, late_s=0.0), *contacts("B", num=40, late_s=0.0)], key=lambda each: each.time_s)
+    found = run(tmp_path, [*both[:20], *shifted(both[20:], ahead_s)])
+    assert seconds(found) == [i + ahead_s for i in range(10, 40)] == seconds(found, "B")
+    (told,) = found.summary["suspicions"]
+    assert told["subject"] == "the whole log" and "2 stretches of 20, 60 detections" in told["seen"]
+
+
+@pytest.mark.parametrize("further_m", [0.0, 300.0])
+def test_a_silence_after_which_targets_are_elsewhere_or_had_stopped_is_none(further_m: float, tmp_path: Path) -> None:
+    slow = np.minimum(np.arange(40), np.maximum(9.5 - 0.5 ** np.arange(40), np.arange(40) - 20.0))  # brakes, waits, goes on
+    places = 5.0 * (slow if not further_m else np.arange(40)) + further_m * (np.arange(40) >= 20)
+    rows = [row("/contacts/A", float(i), START_NS + i * S, x) for i, x in enumerate(places)]
+    assert suspected(run(tmp_path, [*rows[:20], *shifted(rows[20:], 3600.0)])) == []
+
+
+def test_a_silence_of_one_source_is_none(tmp_path: Path) -> None:
+    """Whatever its target does: others went on."""
+    rows = contacts("A", num=40, late_s=0.0)
+    pose = [row("/ownship/pose", 0.5 * i, START_NS + i * S // 2, 0.0) for i in range(400)]
+    seen = sorted([*rows[:20], *shifted(rows[20:], 100.0), *pose], key=lambda each: each.time_s)
+    assert suspected(run(tmp_path, seen)) == []
 
 
 def test_passes_days_apart_are_one_mission(tmp_path: Path) -> None:
