@@ -20,6 +20,10 @@ from pipeline.tables import Frame
 
 GEOREFERENCED_FRAME_ID = "mission"
 DEFAULT_FRAME_ID = "map"
+EARTH_CENTRED = frozenset({"earth", "ecef"})
+"""Frames that REP 105 and receivers have at the centre of the earth: their x and y are no plane."""
+DEGREE_M = 111_195.0
+"""Of latitude, on a sphere: for what need not be exact."""
 DATUM_DECIMALS = 4
 """The datum is rounded to 1e-4 degrees (11 m): easy to state, and equal for small changes of the input."""
 
@@ -59,6 +63,18 @@ def from_earth_centred(x_m: Float64s, y_m: Float64s, z_m: Float64s) -> tuple[Flo
     return (
         np.asarray(latitude, dtype=np.float64), np.asarray(longitude, dtype=np.float64), np.asarray(height_m, dtype=np.float64)
     )  # fmt: skip
+
+
+def east_north_up(latitude_deg: Float64s, longitude_deg: Float64s) -> Float64s:
+    """Rotations [N, 3, 3] from the axes of the earth (ECEF) to east, north and up at places [N]."""
+    latitude, longitude = np.radians(latitude_deg), np.radians(longitude_deg)
+    sin_lat, cos_lat, sin_lon, cos_lon = np.sin(latitude), np.cos(latitude), np.sin(longitude), np.cos(longitude)
+    rows = [
+        [-sin_lon, cos_lon, np.zeros_like(sin_lon)],
+        [-sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat],
+        [cos_lat * cos_lon, cos_lat * sin_lon, sin_lat],
+    ]
+    return np.ascontiguousarray(np.moveaxis(np.array(rows), -1, 0))
 
 
 @functools.cache  # building one takes milliseconds

@@ -1,15 +1,21 @@
 """What stands where no position is known: receivers and trackers write zeros and the like, and call them valid."""
 
+from collections import Counter
+from collections.abc import Iterator
 from typing import Final
 
 import numpy as np
 
 from pipeline.arrays import Bools
-from pipeline.extract.positions import Positions, numbered
+from pipeline.extract.positions import Positions
+from pipeline.frames import DEGREE_M
 from pipeline.suspicions import Suspicions
 
 _FILL_INS: Final = ((0, 0), (-1, -1), (90, 180), (-90, -180), (180, 180), (999, 999), (9999, 9999), (99999, 99999))
-_DEGREE_M: Final = 111_000.0
+_MIN_REPEATS: Final = 2
+_MAX_PLACES: Final = 16
+"""So many places of one kind would be a way along an axis or a diagonal, not what a device writes instead of a place."""
+_MAX_LATITUDE_DEG: Final = 90.0
 _MIN_APART_M: Final = 10.0
 _MIN_JUMP_MPS: Final = 10.0
 _JUMP_RATIO: Final = 10.0
@@ -21,21 +27,20 @@ def without_fill_ins(rows: Positions, role: str, suspicions: Suspicions) -> Posi
     if len(rows) == 0 or not suspicions.looks_for("place"):
         return rows
     is_fill_in = np.zeros(len(rows), np.bool_)
-    for first, second in _FILL_INS:
+    for first, second in (*_FILL_INS, *_repeated(rows)):
         is_value = (rows.first == first) & (rows.second == second)
         if not is_value.any():
             continue
-        agent = numbered(rows.agent)
-        for number in np.unique(agent[is_value]):
-            of_agent = agent == number
-            if _jumps(rows[of_agent], is_value[of_agent]):
+        for of_agent in _by_agent(rows, is_value):
+            is_alone = bool(is_value[of_agent].all())
+            if is_alone and rows.is_geodetic[0] and (first, second) in _FILL_INS:
+                is_fill_in |= is_value & of_agent
+            elif not is_alone and _jumps(rows[of_agent], is_value[of_agent]):
                 is_fill_in |= is_value & of_agent
     if not is_fill_in.any():
         return rows
-    at = " and ".join(
-        f"{first:g}, {second:g}"
-        for first, second in sorted(set(zip(rows.first[is_fill_in], rows.second[is_fill_in], strict=True)))
-    )
+    places = sorted(set(zip(rows.first[is_fill_in], rows.second[is_fill_in], strict=True)))
+    at = " and ".join(f"{first:g}, {second:g}" for first, second in places)
     suspicions.add(
         "place", str(rows.topic[0]),
         seen=f"{int(is_fill_in.sum())} of {len(rows)} positions are at {at}, where none of the others could come from or go to",
@@ -45,11 +50,24 @@ def without_fill_ins(rows: Positions, role: str, suspicions: Suspicions) -> Posi
     return rows[~is_fill_in]
 
 
+def _repeated(rows: Positions) -> list[tuple[float, float]]:
+    """Places of several rows that look written rather than measured: a coordinate is zero, or both are alike but for a sign."""
+    is_odd = (rows.first == 0) | (rows.second == 0) | (np.abs(rows.first) == np.abs(rows.second))
+    is_odd &= np.where(rows.is_geodetic, np.abs(rows.first) <= _MAX_LATITUDE_DEG, np.isfinite(rows.first))  # others are lost
+    counts = Counter(zip(rows.first[is_odd].tolist(), rows.second[is_odd].tolist(), strict=True))
+    chosen = [place for place, count in counts.items() if count >= _MIN_REPEATS and place not in _FILL_INS]
+    return chosen if len(chosen) <= _MAX_PLACES else []
+
+
+def _by_agent(rows: Positions, is_value: Bools) -> Iterator[Bools]:
+    """The rows [N] of each agent that has some of a value."""
+    for number in np.unique(rows.agents.number[is_value]):
+        yield rows.agents.number == number
+
+
 def _jumps(rows: Positions, is_value: Bools) -> bool:
-    """Whether the rows of an agent at one place are beyond reach of its others; of degrees, whether there are no others."""
-    unit_m = _DEGREE_M if rows.is_geodetic[0] else 1.0
-    if is_value.all():
-        return bool(rows.is_geodetic[0])
+    """Whether the rows of an agent at one place are beyond reach of its others."""
+    unit_m = DEGREE_M if rows.is_geodetic[0] else 1.0
     order = np.argsort(rows.time_ns, kind="stable")
     step_m = unit_m * np.hypot(np.diff(rows.first[order]), np.diff(rows.second[order]))
     duration_s = np.diff(rows.time_ns[order]) * 1e-9

@@ -1,13 +1,16 @@
 """Frames of detections that nothing joins to the world: a sensor's coordinates are not taken for places."""
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Mapping
 from typing import Final
+
+import numpy as np
 
 from cadence.errors import InputError
 from pipeline.extract.positions import Positions
 from pipeline.extract.transform_messages import LogTransforms
 from pipeline.extract.transforms import TransformTree
+from pipeline.frames import DEGREE_M
 from pipeline.logs.parts import missing_parts, recorded_parts
 from pipeline.logs.reader import MissionLog
 from pipeline.suspicions import Suspicions
@@ -20,17 +23,20 @@ _FIXED_WORDS: Final = {
 _BODIES: Final = {"base_link", "base_footprint", "base", "body", "chassis", "vehicle"}
 """Frames that move with a vehicle, by REP 105 and custom."""
 _MAX_NAMED: Final = 6
+_MIN_MOVED_M: Final = 30.0
+"""What a receiver that stands scatters by stays below."""
 
 
 def check_joined(
-    rows: Positions, role: str, transforms: LogTransforms, read_tree: Callable[[], TransformTree], log: MissionLog,
-    suspicions: Suspicions,
+    rows: Mapping[str, Positions], role: str, transforms: LogTransforms, read_tree: Callable[[], TransformTree],
+    log: MissionLog, suspicions: Suspicions,
 ) -> None:  # fmt: skip
-    """Refuse rows in metres of a frame that no transform joins, in a log that has transforms, and of a camera's optical frame.
+    """Refuse rows of `role` in metres of a frame that none of the log's transforms joins, and of a camera's optical frame.
 
-    Raises `InputError` with the way out. A vehicle's frame in a log without transforms is told as a suspicion.
+    Raises `InputError` with the way out. A vehicle's frame in a log without transforms is told as a suspicion, and so is any
+    frame beside a sensor that moves in another.
     """
-    names = sorted({str(name) for name in set(rows.frame_id[~rows.is_geodetic]) if name and not _stands_still(str(name))})
+    names = sorted({name for name in _metric_frames(rows[role]) if name and not _stands_still(name)})
     if not names or not suspicions.looks_for("place"):
         return
     tree = read_tree()
@@ -53,6 +59,27 @@ def check_joined(
             "place", f"frame {body}", seen="by its name it moves with a vehicle, and no transform of the log says how",
             done=f"{role} are taken as if it stood still", setting=f'extract.frame = "{body}"',
         )  # fmt: skip
+    others = [name for name in apart if name.rpartition("/")[2] not in _BODIES]
+    if others and role != "poses" and (mover := _mover(rows["poses"], others)):
+        suspicions.add(
+            "place", f"frame {others[0]}", seen=f"no transform of the log says where it is, and {mover}",
+            done=f"{role} are taken as if it stood still", setting=f'extract.frame = "{others[0]}"',
+        )  # fmt: skip
+
+
+def _metric_frames(rows: Positions) -> set[str]:
+    return {str(name) for name in set(rows.frame_id[~rows.is_geodetic])}
+
+
+def _mover(poses: Positions, names: Collection[str]) -> str:
+    """Which sensor moves, in another frame than `names`; empty where none does."""
+    for topic, of_topic in zip(poses.topics.names, poses.topics.rows(), strict=True):
+        found = poses[of_topic]
+        unit_m = DEGREE_M if found.is_geodetic[0] else 1.0
+        way_m = unit_m * np.hypot(np.ptp(found.first), np.ptp(found.second))
+        if way_m > _MIN_MOVED_M and _metric_frames(found).isdisjoint(names):
+            return f"{topic} moves by {way_m:.4g} m"
+    return ""
 
 
 def _stands_still(name: str) -> bool:

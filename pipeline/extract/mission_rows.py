@@ -11,10 +11,11 @@ import numpy as np
 from cadence.errors import InputError, NothingDetectedError
 from pipeline.extract.config import ExtractConfig
 from pipeline.extract.fill_ins import without_fill_ins
+from pipeline.extract.hemispheres import check_hemispheres
 from pipeline.extract.joined import check_joined
 from pipeline.extract.mission_clock import on_one_clock
 from pipeline.extract.names import Naming, without_false_names
-from pipeline.extract.placement import Placing, bring_together, in_enu, mission_frame, place
+from pipeline.extract.placement import Placing, bring_together, datum_of_transforms, in_enu, mission_frame, place
 from pipeline.extract.positions import ChannelReader, Positions, Rows
 from pipeline.extract.reuse import without_reused_names
 from pipeline.extract.selection import ROLES
@@ -38,18 +39,21 @@ def rows_in_frame(
     parts = {role: _numbered([(reader, reader.finish()) for reader in readers if reader.role == role]) for role in ROLES}
     parts = without_set_back(parts, suspicions)
     timed, clock = on_one_clock(parts, suspicions)
-    rows = {role: _columns(_in_place(role, parts[role], timed[role], suspicions), counts) for role in ROLES}
+    placed = {role: _in_place(role, parts[role], timed[role], suspicions) for role in ROLES}
+    check_hemispheres(placed, suspicions)
+    rows = {role: _columns([each for _, each in placed[role]], counts) for role in ROLES}
     primary = "truth" if config.thinning.enabled and config.thinning.thin_from == "truth" else "detections"
     _check_any(primary, rows[primary], counts, suspicions)
     rows = without_unjoined(rows, primary, suspicions)
     placing = Placing(config.frame, Limits(config.max_extrapolation_s, config.max_transform_gap_s))
     read_tree = partial(transforms.read, clock)
     if config.frame is None:
-        check_joined(rows[primary], primary, transforms, read_tree, log, suspicions)
+        check_joined(rows, primary, transforms, read_tree, log, suspicions)
     rows = bring_together(rows, primary, placing, read_tree, counts)
     _check_any(primary, rows[primary], counts, suspicions)
     rows = {role: in_enu(positions) for role, positions in rows.items()}
-    frame = mission_frame(rows[primary], [rows[role] for role in ROLES if role != primary], config.datum)
+    datum = config.datum or datum_of_transforms(rows[primary], read_tree)
+    frame = mission_frame(rows[primary], [rows[role] for role in ROLES if role != primary], datum)
     rows = {role: _placed(role, rows[role], frame, counts, transforms.apart) for role in ROLES}
     rows["detections"] = _identified(rows["detections"], readers, config.simultaneity_s, suspicions)
     rows = {role: _without_spikes(rows[role], config.max_speed_mps, counts) for role in ROLES}
@@ -96,10 +100,12 @@ def _numbered(parts: Sequence[tuple[ChannelReader, Positions]]) -> list[tuple[Ch
 
 def _in_place(
     role: str, parts: Sequence[tuple[ChannelReader, Positions]], timed: Sequence[Positions], suspicions: Suspicions
-) -> list[Positions]:
+) -> list[tuple[ChannelReader, Positions]]:
     """The rows of each reader, whose times are mended, in true units and without fill-ins."""
-    found = [in_true_units(reader.source, role, rows, suspicions) for (reader, _), rows in zip(parts, timed, strict=True)]
-    return [without_fill_ins(rows, role, suspicions) for rows in found]
+    found = [
+        (reader, in_true_units(reader.source, role, rows, suspicions)) for (reader, _), rows in zip(parts, timed, strict=True)
+    ]
+    return [(reader, without_fill_ins(rows, role, suspicions)) for reader, rows in found]
 
 
 def _check_any(role: str, rows: Positions, counts: Counter[str], suspicions: Suspicions) -> None:

@@ -9,13 +9,15 @@ import numpy as np
 from cadence.errors import ConfigError, InputError
 from pipeline.extract.covariances import rotated
 from pipeline.extract.positions import Positions
-from pipeline.extract.transforms import Limits, TransformTree
-from pipeline.frames import DEFAULT_FRAME_ID, georeferenced_frame, to_local
+from pipeline.extract.transforms import Limits, TransformTree, is_of_earth
+from pipeline.frames import DEFAULT_FRAME_ID, EARTH_CENTRED, east_north_up, from_earth_centred, georeferenced_frame, to_local
 from pipeline.tables import Frame
 
 FIXED_FRAMES = {"map", "odom", "world", "mission", "enu", "local", "local_origin", "fixed"}
 """Names of frames that are fixed by convention: what lies in one alone is never moved by transforms."""
 
+_MAX_TURN = 1e-3
+"""By how much the axes of a frame may be off from east, north and up; 1e-3 is a metre in a kilometre."""
 _NED_TO_ENU = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 
 
@@ -65,6 +67,9 @@ def target_frame(primary: Positions, tree: TransformTree, wanted: str | None) ->
     if len(names) == 1 and (names[0] in FIXED_FRAMES or tree.is_fixed(names[0])):
         return names[0]
     worlds = {tree.world(name) for name in names}
+    if len(worlds) > 1:  # what is in a frame of the whole earth joins the only mission's frame below it
+        worlds -= {name for name in worlds if is_of_earth(name)}
+        worlds = {world for world in worlds if all(tree.is_joined(name, world) for name in names)}
     return worlds.pop() if len(worlds) == 1 else None
 
 
@@ -78,11 +83,7 @@ def mission_frame(primary: Positions, others: Sequence[Positions], datum: tuple[
     if datum is not None and len(kinds) > 1:
         kinds.discard(("", True))
     if len(kinds) > 1:
-        parts = ", ".join(f"{topic} ({frame})" for topic, frame in sorted(_topics_with_frames(primary))[:6])
-        raise InputError(
-            f"detections come in different frames: {parts}; no transform of the log joins them: keep the topics of one frame "
-            "under [[extract.detections]], or state extract.datum where one of them is in latitude and longitude"
-        )
+        raise InputError(_several_frames(primary))
     frame_id, is_geodetic = kinds.pop()
     if not frame_id:  # nameless metres are taken to be in the one frame that the rest of the log names
         names = {name for positions in others for name, geodetic in _frames(positions) if name and not geodetic}
@@ -92,6 +93,39 @@ def mission_frame(primary: Positions, others: Sequence[Positions], datum: tuple[
         latitude, longitude = np.concatenate([r.first for r in rows]), np.concatenate([r.second for r in rows])
         return georeferenced_frame(latitude, longitude, datum)
     return Frame(frame_id, *(datum or (None, None)))
+
+
+def datum_of_transforms(positions: Positions, read_tree: Callable[[], TransformTree]) -> tuple[float, float] | None:
+    """Where on the earth the zero of the metres lies, by the transforms; None where no degrees come beside them.
+
+    None as well where nothing joins their only frame to the centre of the earth, or its axes are not east, north and up.
+    """
+    names = {name for name, is_geodetic in _frames(positions) if name and not is_geodetic}
+    if len(names) != 1 or not positions.is_geodetic.any():
+        return None
+    (name,), tree = names, read_tree()
+    centre = next((known for known in tree.ancestors(name) if known.lower() in EARTH_CENTRED), None)
+    if centre is None or not all(tree.links[link].is_static for link in tree.ancestors(name)[:-1]):
+        return None
+    motion = tree.motion(name, centre, np.zeros(1, np.int64), Limits(0.0, 0.0))
+    if motion is None:
+        return None
+    latitude, longitude, _ = from_earth_centred(*motion.translation_m.T)
+    turn = east_north_up(latitude, longitude) @ motion.rotation - np.eye(3)
+    return (float(latitude[0]), float(longitude[0])) if np.abs(turn).max() < _MAX_TURN else None
+
+
+def _several_frames(positions: Positions) -> str:
+    """What to do about positions in frames that nothing joins."""
+    found = sorted(_topics_with_frames(positions))
+    shown = ", ".join(f"{topic} ({frame})" for topic, frame in found[:6]) + (" and so on" if len(found) > 6 else "")
+    ways = ["keep the topics of one frame under [[extract.detections]]"]
+    frames = [frame for topic, frame in found if sum(topic == other for other, _ in found) > 1 and frame in positions.frame_id]
+    if frames:
+        ways.append(f"one frame of a topic by where = 'header.frame_id == \"{frames[0]}\"'")
+    if positions.is_geodetic.any():
+        ways.append("state extract.datum, the place of the metres' zero, which joins them to latitude and longitude")
+    return f"detections come in different frames: {shown}; no transform of the log joins them: {', or '.join(ways)}"
 
 
 def place(positions: Positions, frame: Frame) -> tuple[Positions, int]:

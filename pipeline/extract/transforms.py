@@ -11,8 +11,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from pipeline.arrays import Bools, Float64s, Int64s
+from pipeline.frames import EARTH_CENTRED
 
-_EARTH = {"earth", "ecef", "utm", "wgs84"}
+_EARTH = EARTH_CENTRED | {"utm", "wgs84"}
 """Frames of the whole earth: the mission's frame lies below them."""
 
 _NO_ANGLE = 1e-6
@@ -102,13 +103,17 @@ class TransformTree:
 
     def world(self, frame: str) -> str:
         """The fixed frame that a frame moves in: its root, or what lies directly below the earth's frame."""
-        path = [name for name in self.ancestors(frame) if name.lower() not in _EARTH]
+        path = [name for name in self.ancestors(frame) if not is_of_earth(name)]
         return path[-1] if path else frame
 
     def is_fixed(self, frame: str) -> bool:
         """Whether a frame never moves in its world."""
         path = self.ancestors(frame)
         return all(self.links[name].is_static for name in path[: path.index(self.world(frame))])
+
+    def is_joined(self, frame: str, other: str) -> bool:
+        """Whether a chain of links leads from one frame to the other."""
+        return self.ancestors(frame)[-1] == self.ancestors(other)[-1]
 
     def motion(self, frame: str, target: str, time_ns: Int64s, limits: Limits) -> Motion | None:
         """The poses of `frame` in `target` at time_ns [M]; None where no chain of links joins them."""
@@ -126,6 +131,11 @@ class TransformTree:
         for frame in frames:
             motion = self.links[frame].motion(time_ns, limits).after(motion)
         return motion
+
+
+def is_of_earth(frame: str) -> bool:
+    """Whether a frame is one of the whole earth by its name."""
+    return frame.lower() in _EARTH
 
 
 def tree_of(links: Sequence[Link], problems: Sequence[str] = ()) -> TransformTree:

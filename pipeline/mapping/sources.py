@@ -24,8 +24,8 @@ _CHECKED = (
 )  # fmt: skip
 
 
-Unit = Literal["deg", "rad", "1e-7 deg", "m", "ecef"]
-"""What latitude and longitude (the first three), or x, y and z, are in."""
+Unit = Literal["deg", "rad", "1e-7 deg", "ddmm.mm", "m", "ecef"]
+"""What latitude and longitude (the first four), or x, y and z, are in."""
 
 
 class ChannelLike(Protocol):
@@ -54,8 +54,9 @@ class SourceConfig:
     sensor, sensor_path  who saw it
     x, y, z     message paths of a position in metres
     latitude, longitude, altitude   message paths of a position in degrees (and metres), instead of x, y and z
-    unit        of latitude and longitude: "deg", "rad" or "1e-7 deg"; of x, y and z: "m" (of a plane) or "ecef" (from
-                the earth's centre); default: degrees or metres, but for what can hardly be meant as such
+    unit        of latitude and longitude: "deg", "rad", "1e-7 deg" or "ddmm.mm" (degrees and minutes, as NMEA 0183 has them);
+                of x, y and z: "m" (of a plane) or "ecef" (from the earth's centre); default: degrees or metres, but for what
+                can hardly be meant as such
     where       conditions on fields of the message, all of which must hold: "fix_type >= 3 && lat_lon_valid"; the type's are
                 used where nothing is stated, and "" means none
     covariance  message path of 1, 4, 9 or 36 numbers (a variance, or rows of a matrix), 6 or 21 (an upper triangle) or 3 (a

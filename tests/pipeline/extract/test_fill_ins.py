@@ -29,6 +29,25 @@ def test_a_receiver_without_a_fix_that_does_not_say_so(tmp_path: Path, place: tu
     assert f"{len(times)} of 90 positions are at {place[0]:g}, {place[1]:g}" in suspicion["seen"]
 
 
+@pytest.mark.parametrize("place", [(1.0, 1.0), (48.1, 48.1), (0.0, 11.6), (1e-7, -1e-7)])
+def test_degrees_that_look_written(tmp_path: Path, place: tuple[float, float]) -> None:
+    found = run(tmp_path, [fix(float(i), *place) if 20 <= i < 30 else drive(1, i)[0] for i in range(60)])
+    assert found.summary["num_detections"] == 50 and len(found.summary["suspicions"]) == 1
+
+
+@pytest.mark.parametrize("place", [(1e7, 1e7), (-999.0, -999.0), (2147483647.0, 2147483647.0), (1e38, 1e38), (0.0, 250.0)])
+def test_metres_that_look_written(tmp_path: Path, place: tuple[float, float]) -> None:
+    ways = [place if 20 <= i < 30 else (1500.0 + 5.0 * i, 2500.0) for i in range(60)]
+    found = run(tmp_path, [detection(float(i), *way, agent_id="a") for i, way in enumerate(ways)])
+    assert found.summary["num_detections"] == 50 and len(found.summary["suspicions"]) == 1
+
+
+def test_what_is_off_the_earth_is_counted(tmp_path: Path) -> None:
+    rows = [fix(float(i), *((91.0, 181.0) if i % 2 else (1e7, 1e7))) if 20 <= i < 30 else drive(1, i)[0] for i in range(60)]
+    found = run(tmp_path, rows)
+    assert found.summary["dropped_nonfinite"] == 10 and found.summary["suspicions"] == []
+
+
 def test_nothing_but_zeros(tmp_path: Path) -> None:
     rows = [fix(float(i), 0.0, 0.0) for i in range(10)]
     fails(tmp_path, rows, InputError, "10 of 10 positions are at 0, 0")
@@ -52,6 +71,8 @@ def test_a_tracker_that_waits_at_zero(tmp_path: Path) -> None:
         [detection(float(i), 0.0, 0.0, agent_id="a") for i in range(5)]
         + [detection(60.0 + i, 180.0 + 3.0 * i, 0.0, agent_id="a") for i in range(30)],
         [fix(float(i), 1e-5 * i, 0.0) for i in range(40)],  # a simulator about 0, 0
+        # along an axis, on which it waits, and off it
+        [detection(float(i), 5.0 * min(i, 20), 3.0 * max(0, i - 25), agent_id="a") for i in range(40)],
         [detection(float(i), 0.0, 0.0, agent_id="beacon") for i in range(40)]
         + [detection(float(i), 300.0 + 3.0 * i, 0.0, agent_id="a") for i in range(40)],
     ],

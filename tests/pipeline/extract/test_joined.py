@@ -5,7 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from fixtures.ros_messages import Builder, store_with
-from fixtures.small_logs import Row, detection, time_ns, write_log
+from fixtures.small_logs import Row, detection, fix, pose, time_ns, write_log
+from scipy.spatial.transform import Rotation
 from test_extract import QUIET, fails, mk, run
 
 from cadence.errors import InputError
@@ -71,6 +72,51 @@ def test_a_vehicle_without_transforms_moves_by_its_name(tmp_path: Path) -> None:
     assert run(mk(tmp_path / "b"), seen("robot1/base_link"), frame="robot1/base_link").summary["suspicions"] == []
     mounted = run(mk(tmp_path / "c"), [MOUNT, *seen("radar")])  # its root is the vehicle, which nothing moves
     assert mounted.summary["suspicions"][0]["subject"] == "frame base_link"
+
+
+def test_a_sensor_beside_a_vehicle_that_moves(tmp_path: Path) -> None:
+    """Nothing says where the radar is, and its vehicle is told to move in another frame."""
+
+    def beside(speed_mps: float, frame: str) -> list[Row]:
+        drive = [pose(float(i), speed_mps * i, 0.0, "/ownship/pose", frame) for i in range(20)]
+        return sorted([*seen("radar"), *drive], key=lambda row: row.time_s)
+
+    (suspicion,) = run(mk(tmp_path / "a"), beside(5.0, "map")).summary["suspicions"]
+    assert suspicion["subject"] == "frame radar" and "/ownship/pose moves by 95 m" in suspicion["seen"]
+    for speed_mps, frame in ((0.0, "map"), (5.0, "radar")):
+        assert run(mk(tmp_path / f"{frame}"), beside(speed_mps, frame)).summary["suspicions"] == []
+
+
+def test_what_is_in_a_frame_of_the_earth_joins_the_map(tmp_path: Path) -> None:
+    mount = transform(0.0, "utm", "map", 690_000.0, topic="/tf_static")
+    rows = [mount, *seen("map"), *(detection(float(i), 690_000.0 + i, 30.0, "/other/contacts", frame="utm") for i in range(20))]
+    found = run(tmp_path, sorted(rows, key=lambda row: row.time_s))
+    assert found.frame.frame_id == "map" and max(found.detections["x_m"].to_pylist()) == 100.0
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.3])
+def test_degrees_and_metres_of_a_map_whose_place_the_transforms_tell(tmp_path: Path, turn: float) -> None:
+    """At 0 N 90 E the earth's y is up, its z north, and east is against its x; a map that is turned there is no such."""
+    to_earth = Rotation.from_matrix([[-1, 0, 0], [0, 0, 1], [0, 1, 0]]) * Rotation.from_rotvec([0, 0, turn])
+    rotation = ROS.turn(*to_earth.as_quat())
+    shift = ROS("geometry_msgs/msg/Transform", translation=ROS("geometry_msgs/msg/Vector3", y=6_378_137.0), rotation=rotation)
+    header = ROS.header("earth", time_ns(0))
+    link = ROS("geometry_msgs/msg/TransformStamped", header=header, child_frame_id="map", transform=shift)
+    mount = ROS.cdr_row(ROS("tf2_msgs/msg/TFMessage", transforms=[link]), "/tf_static", 0.0)
+    rows = [mount, *seen("map"), *(fix(float(i), 1e-4 * i, 90.0) for i in range(20))]
+    if turn:
+        fails(tmp_path, rows, InputError, "different frames")
+        return
+    found = run(tmp_path, rows)
+    assert (found.frame.frame_id, found.frame.latitude_deg, found.frame.longitude_deg) == ("map", 0.0, 90.0)
+    assert max(found.detections["y_m"].to_pylist()) == pytest.approx(19 * 11.0574, abs=0.1)
+
+
+def test_two_frames_of_one_topic_and_the_way_out(tmp_path: Path) -> None:
+    rows = [detection(float(i), 3.0 * i, 0.0, frame="odom" if i < 8 else "map") for i in range(20)]
+    fails(mk(tmp_path / "a"), rows, InputError, r"""one frame of a topic by where = 'header.frame_id == "map"'""")
+    found = run(mk(tmp_path / "b"), rows, detections=[{"topic": "/detections", "where": 'frame_id == "odom"'}])
+    assert found.summary["num_detections"] == 8 and found.frame.frame_id == "odom"
 
 
 @pytest.mark.parametrize("frame", ["map", "robot1/odom", "world_ned", "local_origin", "radar", "qualisys", ""])

@@ -87,6 +87,31 @@ def test_a_slow_ship_off_ghana_with_the_decimals_of_degrees(tmp_path: Path) -> N
     assert run(tmp_path, rows).summary["suspicions"] == []
 
 
+@pytest.mark.parametrize("scale", [1e5, 1e6, 600_000.0])
+def test_whole_numbers_of_which_power_nobody_knows(tmp_path: Path, scale: float) -> None:
+    rows = [fix(float(i), round((48.1 + 1e-4 * i) * scale), round(11.6 * scale)) for i in range(30)]
+    fails(tmp_path, rows, InputError, "whole numbers: 1e-7 or 1e-6 degrees, or parts of minutes; left out")
+    told = run(tmp_path, rows, detections=[{"topic": "/contacts/{agent}", "unit": "1e-7 deg"}])
+    assert told.summary["suspicions"] == [] and where(told)[0] == pytest.approx(48.1 * scale / 1e7, rel=1e-3)
+
+
+def minutes(degrees: float) -> float:
+    """Degrees and minutes in one number."""
+    return np.trunc(degrees) * 100 + (degrees - np.trunc(degrees)) * 60
+
+
+@pytest.mark.parametrize("start", [(48.1, 11.6), (-33.999, 151.2), (48.999, -122.3)])
+def test_degrees_and_minutes_as_nmea_has_them(tmp_path: Path, start: tuple[float, float]) -> None:
+    ways = [(start[0] + 1e-4 * i, start[1]) for i in range(30)]
+    rows = [fix(float(i), minutes(latitude), minutes(longitude)) for i, (latitude, longitude) in enumerate(ways)]
+    found = run(tmp_path, rows)
+    assert where(found) == pytest.approx(start, abs=0.01) and east_and_north(found)[1] == pytest.approx(322.0, abs=3.0)
+    (suspicion,) = found.summary["suspicions"]
+    assert suspicion["done"] == "read as degrees and minutes"
+    told = run(tmp_path, rows, detections=[{"topic": "/contacts/{agent}", "unit": "ddmm.mm"}])
+    assert told.summary["suspicions"] == [] and told.detections.equals(found.detections)
+
+
 def test_exchanged_latitudes_and_longitudes(tmp_path: Path) -> None:
     rows = [fix(float(i), 151.2 + 1e-4 * i, -33.9) for i in range(30)]
     found = run(tmp_path, rows)
@@ -183,3 +208,36 @@ def test_units_that_do_not_fit(tmp_path: Path) -> None:
 def test_a_trusted_log_is_taken_as_it_stands(tmp_path: Path) -> None:
     found = run(tmp_path, track(48.1, 11.6, 20.0, np.pi / 180), trusted=["place"])
     assert found.summary["suspicions"] == [] and where(found) == pytest.approx((0.84, 0.2), abs=0.01)
+
+
+def test_scaled_degrees_in_fields_of_metres(tmp_path: Path) -> None:
+    way = np.column_stack([116_000_000 + 1300 * np.arange(40), np.full(40, 481_000_000)])
+    fails(tmp_path, metric(way.astype(float)), InputError, "whole numbers, which may be 1e-7 degrees; left out")
+
+
+def test_radians_in_fields_of_metres_are_named(tmp_path: Path) -> None:
+    way = np.radians(np.column_stack([11.6 + 1e-4 * np.arange(40), np.full(40, 48.1)]))
+    (suspicion,) = run(tmp_path, metric(way)).summary["suspicions"]
+    assert "may be radians" in suspicion["seen"] and "used as metres" in suspicion["done"]
+
+
+def test_what_stands_and_drifts_is_in_metres(tmp_path: Path) -> None:
+    """A filter that settles on a millimetre is smooth, and goes nowhere."""
+    way = np.column_stack([0.3 + 1e-3 * np.exp(-np.arange(60) / 8.0), 0.7 - 1e-3 * np.exp(-np.arange(60) / 5.0)])
+    assert run(tmp_path, metric(way)).summary["suspicions"] == []
+
+
+def test_millimetres_are_named(tmp_path: Path) -> None:
+    way = np.column_stack([1500.0 * np.arange(40), np.full(40, 3e4)])
+    (suspicion,) = run(tmp_path, metric(way)).summary["suspicions"]
+    assert "which move on at 1500 m/s: may be millimetres" in suspicion["seen"]
+    told = run(tmp_path, metric(way), detections=[{"topic": "/contacts/{agent}", "unit": "m"}])
+    assert told.summary["suspicions"] == []
+
+
+def test_noise_of_a_fast_source_is_no_speed(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    rows = metric(rng.normal(0, 30.0, (60, 2)))
+    fast = [Row(row.topic, row.schema, 0.01 * i, row.message | {"header": {"stamp": stamp(0.01 * i), "frame_id": "map"}})  # type: ignore[operator]
+            for i, row in enumerate(rows)]  # fmt: skip
+    assert not any("millimetres" in found["seen"] for found in run(tmp_path, fast).summary["suspicions"])

@@ -1,0 +1,65 @@
+"""Sources in degrees that contradict each other: one has latitude and longitude exchanged, or lost a sign.
+
+Alone such positions look as sound as any others; beside the other sources of the log they lie where these would, mirrored.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Final, Literal
+
+import numpy as np
+
+from pipeline.extract.positions import ChannelReader, Positions
+from pipeline.suspicions import Suspicions
+
+Mirrored = Literal["exchanged", "other side of Greenwich", "other side of the equator", "other side of both"]
+
+_NEAR_DEG: Final = 1.0
+_FAR_DEG: Final = 5.0
+_MAX_SOURCES: Final = 12
+"""Of many that are spread over the earth some are each other's mirror images by chance."""
+_MIRRORS: Final[Mapping[Mirrored, tuple[tuple[int, int], tuple[int, int]]]] = {  # which coordinates, with which signs
+    "exchanged": ((1, 0), (1, 1)),
+    "other side of Greenwich": ((0, 1), (1, -1)),
+    "other side of the equator": ((0, 1), (-1, 1)),
+    "other side of both": ((0, 1), (-1, -1)),
+}
+
+Sources = Mapping[str, Sequence[tuple[ChannelReader, Positions]]]
+
+
+def check_hemispheres(parts: Sources, suspicions: Suspicions) -> None:
+    """Tell of sources, by role, that lie far from all others, but near them when mirrored; which are right nobody knows."""
+    places = {
+        reader.channel.topic: np.array([np.nanmedian(rows.first), np.nanmedian(rows.second)])
+        for found in parts.values()
+        for reader, rows in found
+        if len(rows) and rows.is_geodetic.all() and reader.source.unit is None and np.isfinite(rows.first).any()
+    }
+    if not 1 < len(places) <= _MAX_SOURCES or not suspicions.looks_for("place"):
+        return
+    told: set[str] = set()
+    for topic, place in places.items():
+        others = {name: there for name, there in places.items() if name != topic}
+        if any(_apart_deg(place, there) < _FAR_DEG for there in others.values()):
+            continue
+        for mirrored, (order, signs) in _MIRRORS.items():
+            image = place[list(order)] * signs
+            near = [name for name, there in others.items() if _apart_deg(image, there) < _NEAR_DEG]
+            if near and topic not in told:
+                told |= {topic, *near}
+                _tell(topic, place, mirrored, near, suspicions)
+
+
+def _apart_deg(one: np.ndarray, other: np.ndarray) -> float:
+    latitude, longitude = np.abs(one - other)
+    return float(max(latitude, min(longitude % 360, -longitude % 360)))
+
+
+def _tell(topic: str, place: np.ndarray, mirrored: Mirrored, near: Sequence[str], suspicions: Suspicions) -> None:
+    word = "latitude and longitude exchanged" if mirrored == "exchanged" else f"it on the {mirrored}"
+    suspicions.add(
+        "place", topic,
+        seen=f"it lies about {place[0]:.4g}, {place[1]:.4g}, and with {word} it would lie near {', '.join(near[:3])}",
+        done="used as it stands",
+        setting='latitude and longitude (also "PATH.@negative"), or unit = "deg", in both sources',
+    )  # fmt: skip
