@@ -1,8 +1,8 @@
 """Who tells targets apart, and where were they, where a log does not say which detection came from whom?
 
 Held-out episodes of the world `rendezvous` as one stream of detections, and real ship reports without identity. The association
-of this project (one way, and the mean of several, each agent's detections smoothed by the bank) beside two trackers of Stone
-Soup: global nearest neighbour and joint probabilistic data association, both with Rauch-Tung-Striebel smoothing. The trackers'
+of this project (one hypothesis, and the mean of several, each agent's detections smoothed by the bank) beside two trackers of
+Stone Soup: global nearest neighbour and joint probabilistic data association, both with Rauch-Tung-Striebel smoothing. Their
 settings are searched on other episodes, or on a part of the log that is not scored. All of these know all detections of a log;
 on the ships `cadence run` stands beside them, of which each moment is read from a window that ends two to four minutes later.
 Files in the work folder keep what was done: a killed run goes on where it was.
@@ -38,8 +38,8 @@ from cadence.types import Detections, WindowBatch
 from pipeline.files import write_atomic
 
 WORK = Path("out/benchmarks/association")
-NUM_WAYS = 12
-"""Ways whose tracks are averaged."""
+NUM_ASSOCIATIONS = 12
+"""Association hypotheses whose tracks are averaged."""
 LAG_S = 120.0
 HELD_OUT_SEED, TUNING_SEED = 20263, 20262
 MOTIONS = ((1e-4, 0.0), (1e-3, 0.0), (1e-2, 0.0), (1e-1, 0.0), (3e-3, 3e-4), (1e-2, 1e-3), (3e-2, 3e-3), (1e-1, 1e-2))
@@ -90,33 +90,33 @@ def known(log: Log) -> dict[str, Estimate]:
 
 
 def ours(log: Log) -> dict[str, Estimate]:
-    """The way that agrees most with all, and the weighted mean of several."""
+    """The association that agrees most with all, and the weighted mean of several."""
     covariance = np.broadcast_to(log.sigma_m**2 * np.eye(2), (len(log.time_s), 2, 2))
     config = AssociationConfig(num_agents=log.num_agents)
-    ways = associate(log.time_s, log.position_m, covariance, log.time_s[-1:], config, seed=0)[0]
-    mean, sample = smoothed(log, ways.label[:NUM_WAYS], NUM_SAMPLES)
-    weight = ways.weight[:NUM_WAYS] / ways.weight[:NUM_WAYS].sum()
+    found = associate(log.time_s, log.position_m, covariance, log.time_s[-1:], config, seed=0)[0]
+    mean, sample = smoothed(log, found.label[:NUM_ASSOCIATIONS], NUM_SAMPLES)
+    weight = found.weight[:NUM_ASSOCIATIONS] / found.weight[:NUM_ASSOCIATIONS].sum()
     return {
-        "association, one way": Estimate(mean[0], ways.label[0], agent_probability(ways), sample),
-        "association, mean of ways": Estimate(set_mean(mean, weight)),
+        "association, one hypothesis": Estimate(mean[0], found.label[0], agent_probability(found), sample),
+        "association, mean of hypotheses": Estimate(set_mean(mean, weight)),
     }
 
 
 def set_mean(tracks: Float64s, weight: Float64s) -> Float64s:
-    """Mean [A, T, 2] of tracks [M, A, T, 2] as sets: at each moment those of every way are matched to the first one's.
+    """Mean [A, T, 2] of tracks [M, A, T, 2] as sets: at each moment those of every association are matched to the first one's.
 
-    A mean by name would put agents half-way between two places wherever two ways exchange them; GOSPA knows no names.
+    A mean by name would put agents half-way between two places wherever two associations exchange them; GOSPA knows no names.
     """
     out = tracks[0].copy()
     for step in range(out.shape[1]):
         total = np.where(np.isfinite(out[:, step, 0]), weight[0], 0.0)
         place = np.nan_to_num(out[:, step]) * weight[0]
-        for way in range(1, len(tracks)):
-            distance = np.linalg.norm(tracks[0, :, None, step] - tracks[way, None, :, step], axis=-1)
+        for number in range(1, len(tracks)):
+            distance = np.linalg.norm(tracks[0, :, None, step] - tracks[number, None, :, step], axis=-1)
             rows, columns = linear_sum_assignment(np.nan_to_num(distance, nan=1e12))
             is_pair = np.isfinite(distance[rows, columns])
-            place[rows[is_pair]] += weight[way] * tracks[way, columns[is_pair], step]
-            total[rows[is_pair]] += weight[way]
+            place[rows[is_pair]] += weight[number] * tracks[number, columns[is_pair], step]
+            total[rows[is_pair]] += weight[number]
         is_there = total > 0
         out[is_there, step] = place[is_there] / total[is_there, None]
     return out
@@ -315,7 +315,7 @@ def main() -> int:
         further: dict[str, Estimator] = {} if arguments.without_run else {"run": recorded}
         for name, rows in tables(ships_case(), arguments.jobs, further).items():
             found[name] += rows
-    facts = publishing.facts_of("association") | {"seed": HELD_OUT_SEED, "num_ways": NUM_WAYS}
+    facts = publishing.facts_of("association") | {"seed": HELD_OUT_SEED, "num_associations": NUM_ASSOCIATIONS}
     publishing.publish(Measurement("association", facts, found), section, arguments.publish)
     return 0
 

@@ -3,7 +3,7 @@
 Held-out episodes of the world rendezvous: three agents who meet before their goal or do not, detected in 10 to 12 % of the
 steps. Four networks of one size, trained alike: with known and unknown origin, with attention between agents and without.
 Without attention and with known origin a network is the single-target model, agent by agent. Beside them the shipped network,
-which was trained longer: with known origin, and with detections of unknown origin told apart first (several ways of weight).
+which was trained longer: with known origin, and with detections of unknown origin told apart first (association hypotheses).
 
     python -m benchmarks.rendezvous --publish docs
 """
@@ -47,8 +47,8 @@ SAMPLING = PlaceSampling(precision="bfloat16")
 APART_M = 4000.0
 SOON_M = 1500.0
 """Agents nearer to a site than this are not shown in the picture: that they meet is no question any more."""
-NUM_WAYS = 15
-"""Ways of telling detections apart for a window; each has two hypotheses."""
+NUM_ASSOCIATIONS = 15
+"""Association hypotheses of a window; each has two hypotheses."""
 STEPS = (40, 160)
 """Windows begin so many minutes after their episode: most groups that meet are on their way then, and meet within two hours."""
 KNOWN, KNOWN_ALONE = "known origin, attention", "known origin, no attention (single-target model)"
@@ -160,12 +160,12 @@ def equally_likely(position: Tensor) -> HypothesisSet:
 
 
 def told_apart(model: PlaceModel, windows: ForecastWindows, episodes: JointRecordings) -> HypothesisSet:
-    """Hypotheses for windows whose detections say nothing of their agents; each way of telling them apart has its share.
+    """Hypotheses for windows whose detections say nothing of their agents; each association hypothesis has its share.
 
-    An agent to which a way gives no detection stands where something was seen last.
+    An agent to which one gives no detection stands where something was seen last.
     """
-    slots, per_way = NUM_WAYS, NUM_HYPOTHESES // NUM_WAYS
-    labelled = [labelled_detections(windows, row, episodes) for row in ways_of(windows, episodes)]
+    slots, per_association = NUM_ASSOCIATIONS, NUM_HYPOTHESES // NUM_ASSOCIATIONS
+    labelled = [labelled_detections(windows, row, episodes) for row in associations_of(windows, episodes)]
     parts = []
     for begin in range(0, len(labelled), 20):
         chunk = labelled[begin : begin + 20]
@@ -173,7 +173,7 @@ def told_apart(model: PlaceModel, windows: ForecastWindows, episodes: JointRecor
         w = windows.windows
         seeds = w.seeds[pick] + torch.arange(slots).repeat(len(chunk))
         batch = WindowBatch(w.time_s, joined(chunk), seeds, 0)
-        drawn = model.sample(batch.with_context(windows.context[pick]), per_way).position_m
+        drawn = model.sample(batch.with_context(windows.context[pick]), per_association).position_m
         parts.append(drawn.reshape(len(chunk), NUM_HYPOTHESES, *drawn.shape[2:]))
     position = torch.cat(parts)
     last = torch.stack([_latest(windows.windows.detections[slice(b, b + 1)]) for b in range(len(windows))])
@@ -181,8 +181,8 @@ def told_apart(model: PlaceModel, windows: ForecastWindows, episodes: JointRecor
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Ways:
-    """One window's ways: label [M, N] of the detections at `step` [N], `position_m` [N, 2] in the mission frame."""
+class WindowAssociations:
+    """One window's association hypotheses: label [M, N] of the detections at `step` [N], position_m [N, 2] (mission frame)."""
 
     window: int
     label: Int64s
@@ -190,11 +190,11 @@ class Ways:
     position_m: Float64s
 
 
-def ways_of(windows: ForecastWindows, episodes: JointRecordings) -> list[Ways]:
-    """For every window `NUM_WAYS` ways of equal weight to tell its detections apart."""
-    found: dict[int, Ways] = {}
+def associations_of(windows: ForecastWindows, episodes: JointRecordings) -> list[WindowAssociations]:
+    """For every window `NUM_ASSOCIATIONS` association hypotheses of equal weight."""
+    found: dict[int, WindowAssociations] = {}
     recordings, agents = episodes.recordings, episodes.num_agents
-    config = AssociationConfig(num_agents=agents, num_ways=NUM_WAYS)
+    config = AssociationConfig(num_agents=agents, num_associations=NUM_ASSOCIATIONS)
     for episode in windows.episode.unique().tolist():
         first, end = recordings.offset[[episode * agents, (episode + 1) * agents]]
         seen = recordings.is_detected[first:end].reshape(agents, -1)
@@ -206,24 +206,24 @@ def ways_of(windows: ForecastWindows, episodes: JointRecordings) -> list[Ways]:
         origins = windows.step[mine].numpy()
         covariance = np.broadcast_to(np.eye(2), (len(step), 2, 2))
         time_s = step * recordings.step_s
-        for window, ways in zip(
+        for window, associations in zip(
             mine, associate(time_s, place, covariance, origins * recordings.step_s, config, episode), strict=True
         ):
-            slot = systematic(ways.weight, NUM_WAYS, 0.5)
-            known = ways.num_detections
-            found[window] = Ways(window, ways.label[slot], step[:known], place[:known])
+            slot = systematic(associations.weight, NUM_ASSOCIATIONS, 0.5)
+            known = associations.num_detections
+            found[window] = WindowAssociations(window, associations.label[slot], step[:known], place[:known])
     return [found[window] for window in range(len(windows))]
 
 
-def labelled_detections(windows: ForecastWindows, ways: Ways, episodes: JointRecordings) -> Detections:
-    """The window's detections under each way [M, A, N], relative to the window."""
-    agents, num = episodes.num_agents, ways.label.shape[1]
-    origin, step_s = int(windows.step[ways.window]), episodes.recordings.step_s
-    time_s = torch.from_numpy((ways.step - origin) * step_s).expand(len(ways.label), agents, num)
-    place = torch.from_numpy(ways.position_m) - windows.context.datum_m[ways.window]
-    is_observed = torch.from_numpy(ways.label)[:, None] == torch.arange(agents)[:, None]
+def labelled_detections(windows: ForecastWindows, associations: WindowAssociations, episodes: JointRecordings) -> Detections:
+    """The window's detections under each association [M, A, N], relative to the window."""
+    agents, num = episodes.num_agents, associations.label.shape[1]
+    origin, step_s = int(windows.step[associations.window]), episodes.recordings.step_s
+    time_s = torch.from_numpy((associations.step - origin) * step_s).expand(len(associations.label), agents, num)
+    place = torch.from_numpy(associations.position_m) - windows.context.datum_m[associations.window]
+    is_observed = torch.from_numpy(associations.label)[:, None] == torch.arange(agents)[:, None]
     order = (~is_observed).long().argsort(dim=-1, stable=True)  # left-packed, oldest first
-    place = place.expand(len(ways.label), agents, num, 2).gather(2, order[..., None].expand(-1, -1, -1, 2))
+    place = place.expand(len(associations.label), agents, num, 2).gather(2, order[..., None].expand(-1, -1, -1, 2))
     covariance = torch.eye(2, dtype=torch.float64).expand(*is_observed.shape, 2, 2)
     return Detections(time_s.gather(2, order), place, covariance, is_observed.gather(2, order))
 

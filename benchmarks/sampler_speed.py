@@ -72,7 +72,7 @@ class Case:
 
     @property
     def datum_m(self) -> Tensor:
-        """KeepOut of every row's datum in the obstacles' frame [R, 1, 1, 2]."""
+        """Place of every row's datum in the obstacles' frame [R, 1, 1, 2]."""
         window = self.windows.batch.is_active.nonzero()[:, 0]
         return torch.from_numpy(self.windows.datum_m)[window][:, None, None]
 

@@ -1,7 +1,7 @@
-"""Detections of unknown origin: which agent caused which, in several ways, and windows of detections under each way.
+"""Detections of unknown origin: which agent caused which, and windows of detections under each hypothesis of that.
 
-At a window origin there are many ways to read what was detected so far. Hypotheses are shared out among the ways by weight;
-under its way every hypothesis has detections of known origin and is drawn like any other.
+At a window origin there are many association hypotheses of what was detected so far. The tracks that are to be drawn are shared
+out among them by weight; under its association every joint track has detections of known origin and is drawn like any other.
 """
 
 import itertools
@@ -18,7 +18,7 @@ from cadence.association.associate import associate
 from cadence.association.fitting import fit_habits
 from cadence.association.particles import Stream
 from cadence.association.presence import Habits
-from cadence.association.types import CLUTTER, AssociationConfig, Associations, agent_probability, without_unlikely
+from cadence.association.types import CLUTTER, AssociationConfig, AssociationHypotheses, agent_probability, without_unlikely
 from cadence.constraints.obstacles import Obstacles
 from cadence.errors import InputError
 from cadence.resampling import systematic
@@ -46,19 +46,19 @@ _ROUGH_PARTICLES = 16
 
 
 @dataclass(frozen=True, eq=False)
-class Association:
+class DataAssociation:
     """What the N detections of unknown origin of a log may have come from, as known at every window origin [B].
 
     stream     the detections by time; row [N] where each stands in the DETECTIONS table
     origins_ns [B]
-    ways       [B] labels of the detections up to the origin
+    at_origins [B] hypotheses of the detections up to the origin
     agent_ids  names of the agents, by label
     """
 
     stream: DetectionTrack
     row: Int64s
     origins_ns: Int64s
-    ways: tuple[Associations, ...]
+    at_origins: tuple[AssociationHypotheses, ...]
     agent_ids: tuple[str, ...]
 
     def named(self, detections: pa.Table) -> pa.Table:
@@ -66,7 +66,7 @@ class Association:
 
         Raises `InputError` where nothing is left.
         """
-        label = self.ways[-1].label[0]
+        label = self.at_origins[-1].label[0]
         names = np.array(detections["agent_id"].to_pylist(), dtype=object)
         known = self.row[: len(label)]
         names[known] = [self.agent_ids[agent] if agent != CLUTTER else None for agent in label]
@@ -79,13 +79,13 @@ class Association:
 
     def rows(self, detections: pa.Table) -> pa.Table:
         """ASSOCIATIONS: how likely it is that each agent caused each detection, when it was first known of and in the end."""
-        last = agent_probability(self.ways[-1])
-        known_by = np.array([ways.num_detections for ways in self.ways])
+        last = agent_probability(self.at_origins[-1])
+        known_by = np.array([found.num_detections for found in self.at_origins])
         found: dict[str, list[Any]] = {name: [] for name in ASSOCIATIONS.names}
         first_window = np.searchsorted(known_by, np.arange(len(last)), side="right")
         for window in np.unique(first_window).tolist():
             at = np.flatnonzero(first_window == window)
-            then = agent_probability(self.ways[window])[at]
+            then = agent_probability(self.at_origins[window])[at]
             detection, agent = np.nonzero(np.maximum(then, last[at]) >= _LEAST_PROBABILITY)
             rows = detections.take(pa.array(self.row[at[detection]]))
             found["detection"] += self.row[at[detection]].tolist()
@@ -98,33 +98,33 @@ class Association:
         return pa.Table.from_pydict(found, schema=ASSOCIATIONS)
 
     def labels(self, grid: Grid) -> pa.Table:
-        """LABELS: whose each detection is under the likeliest way of each window."""
+        """LABELS: whose each detection is under the likeliest association of each window."""
         names = pa.array([*self.agent_ids, None], pa.string())  # the label of clutter, -1, is the last
         parts = []
-        for window, ways in enumerate(self.ways):
+        for window, associations in enumerate(self.at_origins):
             begin = int(self.origins_ns[window]) - grid.context_ns
-            known = self.stream.time_ns[: ways.num_detections]
-            low = 0 if window == len(self.ways) - 1 else int(np.searchsorted(known, begin, "right"))
-            label = ways.label[0, low:] % (len(self.agent_ids) + 1)
+            known = self.stream.time_ns[: associations.num_detections]
+            low = 0 if window == len(self.at_origins) - 1 else int(np.searchsorted(known, begin, "right"))
+            label = associations.label[0, low:] % (len(self.agent_ids) + 1)
             columns = [np.full(len(label), window, np.int32), self.row[low : len(known)], names.take(pa.array(label))]
             parts.append(pa.Table.from_arrays([pa.array(column) for column in columns], schema=LABELS))
         return pa.concat_tables(parts)
 
     @staticmethod
-    def of_labels(detections: pa.Table, labels: pa.Table, grid: Grid, default_sigma_m: float = 0.0) -> "Association":
-        """The likeliest way of each window alone, out of LABELS; what a window does not hold is without a label."""
+    def of_labels(detections: pa.Table, labels: pa.Table, grid: Grid, default_sigma_m: float = 0.0) -> "DataAssociation":
+        """The likeliest association of each window alone, out of LABELS; what a window does not hold is without a label."""
         nameless = _Nameless.of(detections, default_sigma_m)
         agent_ids = tuple(sorted(name for name in labels["agent_id"].unique().to_pylist() if name is not None))
         place = np.full(detections.num_rows, -1)
         place[nameless.row] = np.arange(len(nameless.row))
         window, at = labels["window"].to_numpy(), place[labels["detection"].to_numpy()]
         agent = pc.index_in(labels["agent_id"], value_set=pa.array(agent_ids, pa.string())).fill_null(CLUTTER).to_numpy()
-        ways = []
+        at_origins = []
         for number, num_known in enumerate(np.searchsorted(nameless.track.time_ns, grid.origins_ns, "right")):
             label = np.full((1, int(num_known)), CLUTTER)
             label[0, at[window == number]] = agent[window == number]
-            ways.append(Associations(label, np.ones(1), len(agent_ids)))
-        return Association(nameless.track, nameless.row, grid.origins_ns, tuple(ways), agent_ids)
+            at_origins.append(AssociationHypotheses(label, np.ones(1), len(agent_ids)))
+        return DataAssociation(nameless.track, nameless.row, grid.origins_ns, tuple(at_origins), agent_ids)
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,7 +136,7 @@ class Sources:
 
     named: pa.Table
     grid: Grid
-    association: Association | None
+    association: DataAssociation | None
 
 
 def tell_sources(
@@ -158,7 +158,7 @@ def tell_sources(
     habits = fit_habits(nameless.stream, config, seed, max_speed_mps)
     if grid.step_s is None:
         # A few particles tell how long gaps are.
-        rough = replace(config, num_particles=min(config.num_particles, _ROUGH_PARTICLES), num_ways=1)
+        rough = replace(config, num_particles=min(config.num_particles, _ROUGH_PARTICLES), num_associations=1)
         first = nameless.told_apart(planned.origins_ns[-1:], rough, seed, habits)
         planned = plan_grid(first.named(detections), grid)
     association = nameless.told_apart(planned.origins_ns, config, seed, habits)
@@ -186,49 +186,49 @@ class _Nameless:
         position_m = self.track.position_m - self.track.position_m.mean(axis=0)
         return Stream(self._seconds(self.track.time_ns), position_m, self.track.covariance_m2)
 
-    def told_apart(self, origins_ns: Int64s, config: AssociationConfig, seed: int, habits: Habits) -> Association:
+    def told_apart(self, origins_ns: Int64s, config: AssociationConfig, seed: int, habits: Habits) -> DataAssociation:
         stream = self.stream
-        ways = associate(
+        found = associate(
             stream.time_s, stream.position_m, stream.covariance_m2, self._seconds(origins_ns), config, seed, habits=habits
         )
         if config.num_agents is None:
-            ways = without_unlikely(ways)
+            found = without_unlikely(found)
         numbers = (number for number in itertools.count() if f"a{number}" not in self.taken)
-        agent_ids = tuple(f"a{number}" for number in itertools.islice(numbers, ways[-1].num_agents))
-        return Association(self.track, self.row, origins_ns, tuple(ways), agent_ids)
+        agent_ids = tuple(f"a{number}" for number in itertools.islice(numbers, found[-1].num_agents))
+        return DataAssociation(self.track, self.row, origins_ns, tuple(found), agent_ids)
 
     def _seconds(self, time_ns: Int64s) -> Float64s:
         return np.asarray((time_ns - self.track.time_ns[0]) * 1e-9)
 
 
 @dataclass(frozen=True, eq=False)
-class _Reading:
-    """One window: the way of each hypothesis [K], and under each way used, the detections of every agent that has any.
+class _Window:
+    """One window: the association of each track hypothesis [K], and the detections of every agent under each that is used.
 
     probability [A] of each agent's being there; entropy_bits [A] of the origin of its detections in the window.
     """
 
-    way: Int64s
+    association: Int64s
     tracks: tuple[dict[int, Int64s], ...]
     probability: Float64s
     entropy_bits: Float64s
 
 
 @dataclass(frozen=True, eq=False)
-class WayWindows:
-    """Windows of a mission whose detections can be read in several ways.
+class AssociatedWindows:
+    """Windows of a mission with several association hypotheses each.
 
-    windows      every agent's detections under the likeliest way in which it has any: what tables say of them
+    windows      every agent's detections under the likeliest association in which it has any: what tables say of them
     probability, entropy_bits [B, A]  of each agent's being there, and of the origin of its detections; NaN: origin known
     """
 
     windows: MissionWindows
     probability: Float64s
     entropy_bits: Float64s
-    _readings: tuple[_Reading, ...]
+    _each: tuple[_Window, ...]
     _pool: DetectionTrack
 
-    def located(self, start_ns: int, obstacles: Obstacles) -> "WayWindows":
+    def located(self, start_ns: int, obstacles: Obstacles) -> "AssociatedWindows":
         """See `MissionWindows.located`."""
         return replace(self, windows=self.windows.located(start_ns, obstacles))
 
@@ -237,37 +237,37 @@ class WayWindows:
 
         Columns are -1 where an agent is not there. An estimator that treats tracks apart draws every one of them once.
         """
-        readings = self._readings[part]
+        chosen = self._each[part]
         num_agents = len(self.windows.agent_ids)
         index: list[list[Int64s]] = []
-        column = np.full((len(readings), len(readings[0].way), num_agents), -1)
-        for b, reading in enumerate(readings):
+        column = np.full((len(chosen), len(chosen[0].association), num_agents), -1)
+        for b, window in enumerate(chosen):
             place: dict[tuple[int, bytes], int] = {}
             found: list[Int64s] = []
-            for way, tracks in enumerate(reading.tracks):
+            for number, tracks in enumerate(window.tracks):
                 for agent, rows in tracks.items():
                     key = (agent, rows.tobytes())
                     if key not in place:
                         place[key] = len(found)
                         found.append(rows)
-                    column[b, reading.way == way, agent] = place[key]
+                    column[b, window.association == number, agent] = place[key]
             index.append(found)
         names = tuple(str(number) for number in range(max(1, *(len(found) for found in index))))
-        return self._laid_out(index, names, np.arange(len(self._readings))[part]), torch.from_numpy(column)
+        return self._laid_out(index, names, np.arange(len(self._each))[part]), torch.from_numpy(column)
 
-    def ways(self, part: slice) -> tuple[MissionWindows, Int64s, Int64s]:
-        """Every way of some windows as a window of its own [E], whose window it is [E], and its number of hypotheses [E]."""
-        numbers = np.arange(len(self._readings))[part]
+    def by_association(self, part: slice) -> tuple[MissionWindows, Int64s, Int64s]:
+        """Every association of some windows as a window [E], whose it is [E], and its number of track hypotheses [E]."""
+        numbers = np.arange(len(self._each))[part]
         index, window, count = [], [], []
         for b in numbers:
-            reading = self._readings[b]
-            for way, tracks in enumerate(reading.tracks):
+            for number, tracks in enumerate(self._each[b].tracks):
                 index.append([tracks.get(agent, _NONE) for agent in range(len(self.windows.agent_ids))])
                 window.append(b)
-                count.append(int((reading.way == way).sum()))
+                count.append(int((self._each[b].association == number).sum()))
         chosen = np.array(window)
         laid_out = self._laid_out(index, self.windows.agent_ids, chosen)
-        # windows that differ in their way alone must not share their random numbers
+        # windows that differ in their association alone must not share their random numbers; "way" is what it was called first,
+        # and part of the seed
         rank = np.arange(len(chosen)) - np.searchsorted(chosen, chosen)
         seeds = part_seeds(laid_out.batch.seeds, "way", torch.from_numpy(rank))
         return replace(laid_out, batch=replace(laid_out.batch, seeds=seeds)), chosen, np.array(count)
@@ -285,37 +285,37 @@ class WayWindows:
 _NONE = np.zeros(0, dtype=np.int64)
 
 
-def build_way_windows(
+def build_associated_windows(
     detections: pa.Table, sources: Sources, seed: int, num_hypotheses: int, default_sigma_m: float = 0.0
-) -> WayWindows:
-    """The windows of a log with detections of unknown origin, `num_hypotheses` shared out among the ways of each."""
+) -> AssociatedWindows:
+    """The windows of a log with detections of unknown origin, `num_hypotheses` shared out among the associations of each."""
     association, grid = sources.association, sources.grid
     assert association is not None
     named = detections.filter(detections["agent_id"].is_valid())
     known = kept_tracks(named, grid, default_sigma_m)
     agent_ids = tuple(sorted({*known, *association.agent_ids}))
-    builder = _Reader(association, grid, known, agent_ids)
+    builder = _Builder(association, grid, known, agent_ids)
     seeds = window_seeds(seed, len(grid.origins_ns))
-    readings = tuple(builder.read(b, int(seeds[b]), num_hypotheses) for b in range(len(seeds)))
-    pick = _picked([[_first(reading, agent) for agent in range(len(agent_ids))] for reading in readings], len(agent_ids))
+    each = tuple(builder.window(b, int(seeds[b]), num_hypotheses) for b in range(len(seeds)))
+    pick = _picked([[_first(window, agent) for agent in range(len(agent_ids))] for window in each], len(agent_ids))
     datum_m = middle_m(builder.pool, pick)
     found = padded_detections(builder.pool, pick, grid.origins_ns, datum_m)
     batch = WindowBatch(grid.time_s, found, seeds, grid.origin_index)
     windows = MissionWindows(batch, grid.origins_ns, grid.step_ns, agent_ids, datum_m)
-    probability, entropy = (np.stack([getattr(r, name) for r in readings]) for name in ("probability", "entropy_bits"))
-    return WayWindows(windows, probability, entropy, readings, builder.pool)
+    probability, entropy = (np.stack([getattr(window, name) for window in each]) for name in ("probability", "entropy_bits"))
+    return AssociatedWindows(windows, probability, entropy, each, builder.pool)
 
 
-def _first(reading: _Reading, agent: int) -> Int64s:
-    """The agent's detections under the likeliest way that has any."""
-    return next((tracks[agent] for tracks in reading.tracks if agent in tracks), _NONE)
+def _first(window: _Window, agent: int) -> Int64s:
+    """The agent's detections under the likeliest association that has any."""
+    return next((tracks[agent] for tracks in window.tracks if agent in tracks), _NONE)
 
 
 @dataclass(frozen=True, eq=False)
-class _Reader:
-    """Reads windows: detections of unknown origin by their ways, those of known origin alike in all of them."""
+class _Builder:
+    """Builds windows: detections of unknown origin by association, those of known origin alike under all of them."""
 
-    association: Association
+    association: DataAssociation
     grid: Grid
     known: dict[str, DetectionTrack]
     agent_ids: tuple[str, ...]
@@ -330,24 +330,24 @@ class _Reader:
         """Column of each label."""
         return np.array([self.agent_ids.index(name) for name in self.association.agent_ids], dtype=np.int64)
 
-    def read(self, b: int, seed: int, num_hypotheses: int) -> _Reading:
-        """The ways of window `b`."""
+    def window(self, b: int, seed: int, num_hypotheses: int) -> _Window:
+        """Window `b` under each of its associations."""
         origin_ns = int(self.grid.origins_ns[b])
-        start_ns, ways = origin_ns - self.grid.context_ns, self.association.ways[b]
-        low = int(np.searchsorted(self.association.stream.time_ns[: ways.num_detections], start_ns, "right"))
-        label = ways.label[:, low:]
+        start_ns, associations = origin_ns - self.grid.context_ns, self.association.at_origins[b]
+        low = int(np.searchsorted(self.association.stream.time_ns[: associations.num_detections], start_ns, "right"))
+        label = associations.label[:, low:]
         fixed = self._fixed(start_ns, origin_ns)
-        owner = shared_out(ways.weight, num_hypotheses, seed)
-        used, way = np.unique(owner, return_inverse=True)
+        owner = shared_out(associations.weight, num_hypotheses, seed)
+        used, association = np.unique(owner, return_inverse=True)
         tracks = tuple(fixed | self._tracks(label[number], low) for number in used)
         probability, entropy = np.full((2, len(self.agent_ids)), np.nan)
         is_there = np.stack([(label == agent).any(axis=1) for agent in range(len(self._column))], axis=-1)  # [M, A]
-        probability[self._column] = ways.weight @ is_there
-        entropy[self._column] = _entropy_bits(agent_probability(replace(ways, label=label)))
-        return _Reading(way, tracks, probability, entropy)
+        probability[self._column] = associations.weight @ is_there
+        entropy[self._column] = _entropy_bits(agent_probability(replace(associations, label=label)))
+        return _Window(association, tracks, probability, entropy)
 
     def _tracks(self, label: Int64s, low: int) -> dict[int, Int64s]:
-        """By agent: which detections of the stream are its under one way, the first and the last of every step."""
+        """By agent: which detections of the stream are its under one association, the first and the last of every step."""
         found = {}
         for agent in np.unique(label[label != CLUTTER]).tolist():
             rows = low + np.flatnonzero(label == agent)
@@ -365,7 +365,7 @@ class _Reader:
 
 
 def shared_out(weight: Float64s, num_hypotheses: int, seed: int) -> Int64s:
-    """The way of each hypothesis [K] by systematic resampling of the weights [M]: way m gets within one of K w_m of them."""
+    """The association of each track hypothesis [K] by systematic resampling of weights [M]: m gets K w_m, within one."""
     return systematic(weight, num_hypotheses, np.random.default_rng(seed).random())
 
 

@@ -90,7 +90,7 @@ LABELS = pa.schema(
         pa.field("agent_id", pa.string()),  # null = clutter
     ]
 )
-"""One row per window and detection of unknown origin in it, under the likeliest way to tell them apart.
+"""One row per window and detection of unknown origin in it, under the likeliest association hypothesis.
 
 The last window has a row for every detection so far, also for those before its beginning.
 """

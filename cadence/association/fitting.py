@@ -26,7 +26,7 @@ _TEMPER = 0.6
 _FLOOR = 1e-5
 """No detection counts as more exact than this share of the stream's extent."""
 _LEAST_CLUTTER = 1e-6
-"""A detection that fits nobody must not rule out all ways, whatever the settings say."""
+"""A detection that fits nobody must not rule out all hypotheses, whatever the settings say."""
 _NUM_AGENTS = (3, 10, 30)
 _FIRST_DEPARTURES = 0.5
 """How many agents are thought to leave within a log before anything is known."""
@@ -94,7 +94,7 @@ def _run(stream: Stream, habits: Habits, seed: int) -> tuple[Particles, Float64s
 
 
 def _improved(habits: Habits, particles: Particles, usage: Float64s, stream: Stream) -> Habits:
-    """Habits after one round: modes as often as they were used, rates as a way of the likeliest particle counts them."""
+    """Habits after one round: modes as often as they were used, rates as one history of the likeliest particle counts them."""
     share = usage + _PSEUDO_COUNT / len(usage)
     share = share / share.sum()
     is_used = share >= _LEAST_SHARE
@@ -103,7 +103,7 @@ def _improved(habits: Habits, particles: Particles, usage: Float64s, stream: Str
         modes.relaxation_s[is_used], modes.speed_mps[is_used], share[is_used] / share[is_used].sum(), modes.switch_share
     )
     best = np.array([particles.weight.argmax()])
-    label = particles.ways(best, np.random.default_rng(0))[0]
+    label = particles.associations(best, np.random.default_rng(0))[0]
     gaps_s = [np.diff(stream.time_s[label == agent]) for agent in range(int(label.max()) + 1)]
     watched_s, again = sum(float(gap.sum()) for gap in gaps_s), sum(map(len, gaps_s))
     if again < 1 or watched_s <= 0:
@@ -116,7 +116,7 @@ def _improved(habits: Habits, particles: Particles, usage: Float64s, stream: Str
 
 
 def _with_rates(habits: Habits, tracks: Tracks, rate_hz: float, watched_s: float, span_s: float) -> Habits:
-    """How often agents are detected, come and leave, as one way counts it."""
+    """How often agents are detected, come and leave, as one association hypothesis counts it."""
     num = int(tracks.num_agents[0])
     left = left_by(tracks, habits, span_s)[0, :num]
     watched_s += float(((1.0 - left) * (span_s - tracks.last_s[0, :num])).sum())

@@ -1,9 +1,9 @@
 """How the particles came about: a graph of steps instead of one list of labels a particle.
 
-Ways that agree on the last few detections of every agent have the same future, whatever they make of what lies before: they
-are one particle from then on (combining hypotheses of common recent history; Reid, "An algorithm for tracking multiple
-targets", 1979). The graph keeps all of their pasts with their weights, and whole ways are drawn from it backwards. Copies of
-labels, of which resampling keeps one after a while, would say of an old doubt that it is settled.
+Association hypotheses that agree on the last few detections of every agent have the same future, whatever they make of what
+lies before: they are one particle from then on (combining hypotheses of common recent history; Reid, "An algorithm for tracking
+multiple targets", 1979). The graph keeps all of their pasts with their weights, and whole ones are drawn from it backwards.
+Copies of labels, of which resampling keeps one after a while, would say of an old doubt that it is settled.
 """
 
 from collections.abc import Sequence
@@ -48,10 +48,10 @@ def recently(recent: Int64s, agent: Int64s, number: int) -> Int64s:
 
 
 def grouped(recent: Int64s) -> tuple[Int64s, Int64s]:
-    """Which of W ways agree on the last detections of all agents [W, A, L], whatever they call them.
+    """Which of W association hypotheses agree on the last detections of all agents [W, A, L], whatever they call them.
 
     Returns:
-        The group of each way [W], and its agents by the time of their last detection [W, A], which says who is who in a group.
+        The group of each hypothesis [W], and its agents by the time of their last detection [W, A]: who is who in a group.
     """
     order = np.argsort(recent[..., -1], axis=1, kind="stable")
     ordered = np.ascontiguousarray(np.take_along_axis(recent, order[..., None], axis=1).reshape(len(recent), -1))
@@ -62,7 +62,7 @@ def grouped(recent: Int64s) -> tuple[Int64s, Int64s]:
 def step_of(
     weight: Float64s, parent: Int64s, agent: Int64s, group: Int64s, order: Int64s, child_of_group: Int64s
 ) -> tuple[Step, Int64s]:
-    """The edges of W weighted ways [W] whose groups became children (-1: of no child), and the heaviest way of each child."""
+    """The edges of W weighted hypotheses [W] whose groups became children (-1: of no child), and each child's heaviest one."""
     heaviest_first = np.lexsort((-weight, group))
     first_of_group = heaviest_first[np.searchsorted(group[heaviest_first], np.arange(len(child_of_group)))]
     share = weight / np.bincount(group, weight)[group]
@@ -83,8 +83,8 @@ def step_of(
     )
 
 
-def drawn_ways(steps: Sequence[Step], particle: Int64s, generator: np.random.Generator) -> Int64s:
-    """Labels [M, N] of one way for each of M particles after the last step, drawn from all that led there."""
+def drawn_associations(steps: Sequence[Step], particle: Int64s, generator: np.random.Generator) -> Int64s:
+    """Labels [M, N] of one association hypothesis for each of M particles after the last step, drawn from its pasts."""
     rows = np.arange(len(particle))
     label = np.empty((len(particle), len(steps)), dtype=np.int64)
     num_agents = max((step.names.shape[1] for step in steps), default=0)

@@ -1,7 +1,7 @@
-"""Names of agents that hold over all ways to read a log and over all window origins.
+"""Names of agents that hold over all association hypotheses of a log and over all window origins.
 
-Every way numbers its agents as it meets them. Here they get the names of the agents of a way that was named before, matched
-by the detections that both give to them (the assignment of greatest overlap). The last ones count most: of two ways that part
+Every hypothesis numbers its agents as it meets them. Here they get the names of agents of one that was named before, matched
+by the detections that both give to them (the assignment of greatest overlap). The last ones count most: of two that part
 early, by an exchange of two agents, names are to say who is where now.
 """
 
@@ -12,13 +12,13 @@ from cadence.arrays import Int64s
 from cadence.association.types import CLUTTER
 
 _FORGETTING = 0.8
-"""What a detection counts, to the power of how many later ones of the same agent there are, in either way."""
+"""What a detection counts, to the power of how many later ones of the same agent there are, in either hypothesis."""
 
 
 def named_like(label: Int64s, reference: Int64s) -> Int64s:
     """The labels [N] renamed after a reference [N'] for the first N' detections; agents without overlap get free names.
 
-    Free names are the smallest that no agent of this way has got, so that as few as possible are used in all.
+    Free names are the smallest that no agent of this hypothesis has got, so that as few as possible are used in all.
     """
     num_own = int(label.max(initial=CLUTTER)) + 1
     num_other = int(reference.max(initial=CLUTTER)) + 1

@@ -1,8 +1,8 @@
-"""The filter: many ways to read a stream side by side, each with its agents' Kalman filters.
+"""The filter: many association hypotheses of a stream side by side, each with its agents' Kalman filters.
 
 Rao-Blackwellised particle data association (Särkkä, Vehtari, Lampinen, "Rao-Blackwellized particle filter for multiple target
-tracking", 2007). Every way is continued by every agent that may have caused the next detection, and of all continuations the
-best are kept and the others drawn from (`resampling`), which is the optimal importance distribution without its noise. Ways
+tracking", 2007). Every one is continued by every agent that may have caused the next detection, and of all continuations the
+best are kept and the others drawn from (`resampling`), which is the optimal importance distribution without its noise. Those
 that have become alike are one from then on (`history`).
 """
 
@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from cadence.arrays import Bools, Float64s, Int64s
-from cadence.association.history import Step, drawn_ways, grouped, recently, step_of
+from cadence.association.history import Step, drawn_associations, grouped, recently, step_of
 from cadence.association.presence import Habits, log_hazards, log_silence_between
 from cadence.association.tracks import Detection, Tracks, log_densities, updated
 from cadence.association.types import CLUTTER
@@ -22,7 +22,7 @@ NUM_RECENT = 3
 """An agent's last detections from which its future follows: older ones say little that these do not."""
 
 _NEGLIGIBLE = 1e-6
-"""Ways of less weight are given up even where there is room: a clear stretch of a stream needs few."""
+"""Hypotheses of less weight are given up even where there is room: a clear stretch of a stream needs few."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,10 +53,10 @@ class Stream:
 
 @dataclass(frozen=True, eq=False)
 class Particles:
-    """P ways to read the first N detections, each with all pasts that led to it.
+    """P association hypotheses of the first N detections, each with all pasts that led to it.
 
     weight        [P] sums to one
-    tracks        what each way knows of its agents, which it numbers by itself
+    tracks        what each one knows of its agents, which it numbers by itself
     recent        [P, A, L] the last detections of each agent, oldest first, -1 for none
     steps         [N] how the particles came about
     log_evidence  log density of the detections so far
@@ -68,15 +68,15 @@ class Particles:
     steps: list[Step]
     log_evidence: float
 
-    def ways(self, particle: Int64s, generator: np.random.Generator) -> Int64s:
-        """Labels [M, N] of one way for each of M particles, drawn from its pasts."""
-        return drawn_ways(self.steps, particle, generator)
+    def associations(self, particle: Int64s, generator: np.random.Generator) -> Int64s:
+        """Labels [M, N] of one hypothesis for each of M particles, drawn from its pasts."""
+        return drawn_associations(self.steps, particle, generator)
 
 
 def follow(stream: Stream, habits: Habits, num_particles: int, seed: int, num_recent: int = NUM_RECENT) -> Iterator[Particles]:
     """The particles before the first detection and after each one: N + 1 times, each valid until the next is asked for.
 
-    Ways that agree on the last `num_recent` detections of every agent are one particle.
+    Hypotheses that agree on the last `num_recent` detections of every agent are one particle.
     """
     generator = np.random.default_rng(seed)
     recent = np.zeros((1, 0, num_recent), dtype=np.int64)
@@ -113,11 +113,11 @@ def _next(
     kept, new_weight = resample(group_share / group_share.sum(), num_particles, uniform)
     child = np.full(len(group_share), -1)
     child[kept] = np.arange(len(kept))
-    step, way = step_of(share[flat], parent, agent, group, order, child)
+    step, heaviest = step_of(share[flat], parent, agent, group, order, child)
     particles.steps.append(step)
     log_evidence = particles.log_evidence + peak + float(np.log(total))
-    after = updated(tracks[parent[way]], habits.modes, seen, agent[way], habits.rate_memory)
-    return Particles(new_weight, after, recent[way], particles.steps, log_evidence)
+    after = updated(tracks[parent[heaviest]], habits.modes, seen, agent[heaviest], habits.rate_memory)
+    return Particles(new_weight, after, recent[heaviest], particles.steps, log_evidence)
 
 
 def _with_room(recent: Int64s, num_slots: int) -> Int64s:

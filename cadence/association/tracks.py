@@ -1,4 +1,4 @@
-"""What each way of reading the log knows of its agents: a Kalman filter an agent and mode, as of the agent's last detection."""
+"""What each association hypothesis knows of its agents: a Kalman filter an agent and mode, as of the agent's last detection."""
 
 import dataclasses
 import math

@@ -337,7 +337,7 @@ def _joint_preface(report: ScoreReport) -> list[str]:
     if any(log.is_matched for log in report.logs):
         lines.append(
             "Where detections are of unknown origin, agents are matched to those of the truth, window by window, by the "
-            "detections that they were given; rivals see the detections under the likeliest way to tell them apart."
+            "detections that they were given; rivals see the detections under the likeliest association."
         )
     return [*lines, ""]
 

@@ -1,4 +1,4 @@
-"""Windows in chunks to hypotheses, also where their detections can be read in several ways: each is drawn under its own way."""
+"""Windows in chunks to hypotheses; where detections are of unknown origin, each is drawn under its own association."""
 
 from collections.abc import Iterator
 
@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from cadence.types import Estimator
-from pipeline.associations import WayWindows
+from pipeline.associations import AssociatedWindows
 from pipeline.windows import MissionWindows
 
 _WINDOWS_AT_ONCE = 32
@@ -40,11 +40,11 @@ def _by_tracks(windows: MissionWindows) -> Iterator[Tensor]:
             yield part
 
 
-def draw_tracks(estimator: Estimator, ways: WayWindows, num_hypotheses: int) -> Iterator[Drawn]:
-    """For estimators that treat agents apart: every different track of a window is drawn once, and joined by the ways."""
-    for whole in _by_windows(ways.windows.batch.num_windows):
+def draw_tracks(estimator: Estimator, associated: AssociatedWindows, num_hypotheses: int) -> Iterator[Drawn]:
+    """For estimators that treat agents apart: every different track of a window is drawn once, and joined by association."""
+    for whole in _by_windows(associated.windows.batch.num_windows):
         begin = int(whole[0])
-        windows, column = ways.tracks(slice(begin, begin + len(whole)))
+        windows, column = associated.tracks(slice(begin, begin + len(whole)))
         for part, position, weight, status in draw_windows(estimator, windows, num_hypotheses, is_apart=True):
             yield begin + part, *_joined(column[part], position, weight, status)
 
@@ -66,14 +66,14 @@ def _worst(status: list[str]) -> str:
     return next((word for word in _WORST_FIRST if word in status), "no_detections")
 
 
-def draw_ways(estimator: Estimator, ways: WayWindows, num_hypotheses: int) -> Iterator[Drawn]:
-    """For estimators whose agents see each other: every way is a window, drawn as often as it has hypotheses."""
-    whole = ways.windows
+def draw_associations(estimator: Estimator, associated: AssociatedWindows, num_hypotheses: int) -> Iterator[Drawn]:
+    """For estimators whose agents see each other: every association is a window, drawn as often as it has hypotheses."""
+    whole = associated.windows
     num_agents, num_steps = len(whole.agent_ids), whole.batch.num_steps
     for part in _by_windows(whole.batch.num_windows):
         begin = int(part[0])
-        some, window, count = ways.ways(slice(begin, begin + len(part)))
-        # hypotheses of a window by way: where those of each way begin
+        some, window, count = associated.by_association(slice(begin, begin + len(part)))
+        # hypotheses of a window by association: where those of each begin
         first = np.cumsum(count) - count - num_hypotheses * (window - begin)
         position = torch.full((len(part), num_hypotheses, num_agents, num_steps, 2), torch.nan, dtype=torch.float64)
         weight = torch.zeros(len(part), num_hypotheses, dtype=torch.float64)

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from cadence import metrics
-from pipeline.associations import WayWindows
+from pipeline.associations import AssociatedWindows
 from pipeline.windows import Grid, MissionWindows
 from schemas.tables import WINDOWS, hypotheses_schema
 
@@ -74,10 +74,10 @@ def window_rows(windows: MissionWindows, part: Tensor, position: Tensor, weight:
     return pa.Table.from_pylist(rows, schema=WINDOWS)
 
 
-def with_association(rows: pa.Table, ways: WayWindows, part: Tensor) -> pa.Table:
+def with_association(rows: pa.Table, associated: AssociatedWindows, part: Tensor) -> pa.Table:
     """WINDOWS rows of some windows with what is said of agents whose detections are of unknown origin."""
     window = part.numpy()
-    for name, value in (("probability", ways.probability), ("association_entropy_bits", ways.entropy_bits)):
+    for name, value in (("probability", associated.probability), ("association_entropy_bits", associated.entropy_bits)):
         index = WINDOWS.get_field_index(name)
         rows = rows.set_column(index, WINDOWS.field(name), pa.array(value[window].reshape(-1), from_pandas=True))
     return rows

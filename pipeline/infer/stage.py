@@ -10,7 +10,7 @@ import pyarrow.compute as pc
 
 from cadence.constraints.obstacles import Obstacles
 from cadence.errors import ImplausibleInputError
-from pipeline.associations import Sources, WayWindows, build_way_windows, tell_sources
+from pipeline.associations import AssociatedWindows, Sources, build_associated_windows, tell_sources
 from pipeline.catalogue import read_catalogue
 from pipeline.checkpoints import DEFAULT, checkpoint_hash, read_info
 from pipeline.estimators.fit_test import FitTest, fit_test
@@ -18,7 +18,7 @@ from pipeline.estimators.fitting import FittingData
 from pipeline.estimators.loaded import Loaded
 from pipeline.estimators.presets import find_weights, load_estimator, refuse_unread
 from pipeline.infer.config import InferConfig
-from pipeline.infer.draws import Drawn, draw_tracks, draw_ways, draw_windows
+from pipeline.infer.draws import Drawn, draw_associations, draw_tracks, draw_windows
 from pipeline.infer.rows import hypothesis_rows, window_rows, with_association
 from pipeline.manifest import StageResult, run_stage
 from pipeline.missions import CATALOGUE_NAME
@@ -89,7 +89,7 @@ def _draw(plan: "_Plan", log_id: str, folder: Path, frame: Frame, progress: Prog
         for part, positions, weight, status in plan.draws:
             parts.append(hypothesis_rows(log_id, plan.windows, plan.seen.sources.grid, part, positions, weight))
             rows = window_rows(plan.windows, part, positions, weight, status)
-            statuses.append(rows if plan.seen.ways is None else with_association(rows, plan.seen.ways, part))
+            statuses.append(rows if plan.seen.associated is None else with_association(rows, plan.seen.associated, part))
             bar.update(len(part))
     tracks, windows = pa.concat_tables(parts), pa.concat_tables(statuses)
     write_table(tracks, folder / "hypotheses.parquet", "hypotheses", frame)
@@ -105,11 +105,11 @@ def _draw(plan: "_Plan", log_id: str, folder: Path, frame: Frame, progress: Prog
 
 @dataclass(frozen=True, eq=False)
 class _Seen:
-    """The windows, by name; `ways` where there are several ways to tell whose detections they hold."""
+    """The windows, by name; `associated` where they have several association hypotheses."""
 
     sources: Sources
     named: MissionWindows
-    ways: WayWindows | None
+    associated: AssociatedWindows | None
 
     @staticmethod
     def of(config: InferConfig, detections: pa.Table, loaded: Loaded) -> "_Seen":
@@ -118,20 +118,22 @@ class _Seen:
         grid = loaded.grid(config.grid)
         sources = tell_sources(detections, grid, association, config.seed, sigma_m, config.guidance.max_speed_mps)
         named = build_windows(sources.named, sources.grid, config.seed, sigma_m)
-        is_told = sources.association is not None
-        ways = build_way_windows(detections, sources, config.seed, config.num_hypotheses, sigma_m) if is_told else None
-        return _Seen(sources, named, ways)
+        if sources.association is None:
+            return _Seen(sources, named, None)
+        associated = build_associated_windows(detections, sources, config.seed, config.num_hypotheses, sigma_m)
+        return _Seen(sources, named, associated)
 
     def about(self) -> dict[str, Any]:
         """What the summary says of detections of unknown origin; empty where there are none."""
         association = self.sources.association
         if association is None:
             return {}
+        at_origins = association.at_origins
         return {
             "association": {
                 "num_detections": len(association.stream),
                 "num_agents": len(association.agent_ids),
-                "mean_num_ways": sum(ways.num_ways for ways in association.ways) / len(association.ways),
+                "mean_num_associations": sum(one.num_associations for one in at_origins) / len(at_origins),
             }
         }
 
@@ -162,17 +164,17 @@ class _Plan:
             about["fit_test"] = None if test is None else asdict(test)
         fitted = loaded.fitted(data)
         estimator, num = fitted.estimator, config.num_hypotheses
-        if seen.ways is None:
+        if seen.associated is None:
             draws = draw_windows(estimator, seen.named.located(start_ns, obstacles), num, loaded.is_apart)
         else:
-            ways = seen.ways.located(start_ns, obstacles)
-            draws = (draw_tracks if loaded.is_apart else draw_ways)(estimator, ways, num)
+            associated = seen.associated.located(start_ns, obstacles)
+            draws = (draw_tracks if loaded.is_apart else draw_associations)(estimator, associated, num)
         return _Plan(config.checkpoint, seen, draws, {**fitted.about, **about}, suspicions)
 
     @property
     def windows(self) -> MissionWindows:
         """What the tables speak of."""
-        return self.seen.named if self.seen.ways is None else self.seen.ways.windows
+        return self.seen.named if self.seen.associated is None else self.seen.associated.windows
 
 
 def _suspect(test: FitTest, config: InferConfig, suspicions: Suspicions) -> None:

@@ -13,7 +13,7 @@ from torch import Tensor
 from cadence.constraints.checker import segments_in_collision, states_in_collision
 from cadence.errors import InputError
 from cadence.types import HypothesisSet, WindowBatch
-from pipeline.associations import Association, Sources, build_way_windows
+from pipeline.associations import DataAssociation, Sources, build_associated_windows
 from pipeline.manifest import read_manifest
 from pipeline.obstacle_file import OBSTACLES_NAME, read_obstacles
 from pipeline.results import MissionHypotheses
@@ -113,12 +113,12 @@ def read_case(
 def _seen(
     detections: pa.Table, grid: Grid, sigma_m: float, seed: int, labels: pa.Table | None
 ) -> tuple[MissionWindows, pa.Table]:
-    """Windows as they were inferred from, those of unknown origin under the likeliest way, and the detections by agents."""
+    """Windows as they were inferred from, of unknown origin under the likeliest association, and the detections by agents."""
     if labels is None:
         return build_windows(detections, grid, seed, sigma_m), detections
-    found = Association.of_labels(detections, labels, grid, sigma_m)
+    found = DataAssociation.of_labels(detections, labels, grid, sigma_m)
     sources = Sources(found.named(detections), grid, found)
-    return build_way_windows(detections, sources, seed, 1, sigma_m).windows, sources.named
+    return build_associated_windows(detections, sources, seed, 1, sigma_m).windows, sources.named
 
 
 def _is_counted(stored: MissionHypotheses, agent_ids: tuple[str, ...]) -> Tensor:

@@ -202,3 +202,4 @@ def test_tables_of_0_3_are_read():
     assert read_config(ForecastConfig, {"scene": {"num_steps": 3}}).place == PlaceSampling(num_steps=3)
     train = read_config(TrainConfig, {"preset": "scene", "scene": {"few_steps": 3}})
     assert (train.preset, train.place.few_steps) == ("place", 3)
+    assert read_config(InferConfig, {"association": {"num_ways": 7}}).association.num_associations == 7

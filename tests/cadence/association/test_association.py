@@ -8,7 +8,7 @@ from cadence.association.associate import associate
 from cadence.association.fitting import fit_habits
 from cadence.association.naming import named_like
 from cadence.association.particles import Stream
-from cadence.association.types import CLUTTER, AssociationConfig, Associations, agent_probability, without_unlikely
+from cadence.association.types import CLUTTER, AssociationConfig, AssociationHypotheses, agent_probability, without_unlikely
 
 KNOWN = AssociationConfig(num_agents=2, num_particles=40)
 
@@ -118,15 +118,15 @@ def test_agents_come_and_go_where_their_number_is_unknown():
 
 def test_agents_that_are_never_likely_are_clutter():
     """Of three agents the second is likelier absent than there, at first and, with other weights, later on."""
-    first = Associations(np.array([[0, 1], [0, 0]]), np.array([0.3, 0.7]), 3)
-    last = Associations(np.array([[0, 1, 2], [0, 0, 2], [-1, 0, 2]]), np.array([0.5, 0.3, 0.2]), 3)
+    first = AssociationHypotheses(np.array([[0, 1], [0, 0]]), np.array([0.3, 0.7]), 3)
+    last = AssociationHypotheses(np.array([[0, 1, 2], [0, 0, 2], [-1, 0, 2]]), np.array([0.5, 0.3, 0.2]), 3)
     early, late = without_unlikely([first, last])
     assert early.label.tolist() == [[0, CLUTTER], [0, 0]] and early.num_agents == late.num_agents == 2
     assert late.label.tolist() == [[0, CLUTTER, 1], [0, 0, 1], [CLUTTER, 0, 1]]
     assert late.weight.tolist() == last.weight.tolist()
-    likelier = Associations(first.label, np.array([0.6, 0.4]), 3)
+    likelier = AssociationHypotheses(first.label, np.array([0.6, 0.4]), 3)
     assert [found.num_agents for found in without_unlikely([likelier, last])] == [3, 3]
-    assert without_unlikely([Associations(np.zeros((1, 0), np.int64), np.ones(1), 0)])[0].num_agents == 0
+    assert without_unlikely([AssociationHypotheses(np.zeros((1, 0), np.int64), np.ones(1), 0)])[0].num_agents == 0
 
 
 @pytest.mark.parametrize("number", [0, 1])
@@ -145,8 +145,8 @@ def test_exact_detections_at_one_place_are_no_defect():
 
 
 def test_probabilities_by_hand():
-    ways = Associations(np.array([[0, 1, -1], [1, 1, 0]]), np.array([0.75, 0.25]), 2)
-    np.testing.assert_allclose(agent_probability(ways), [[0.75, 0.25, 0.0], [0.0, 1.0, 0.0], [0.25, 0.0, 0.75]])
+    found = AssociationHypotheses(np.array([[0, 1, -1], [1, 1, 0]]), np.array([0.75, 0.25]), 2)
+    np.testing.assert_allclose(agent_probability(found), [[0.75, 0.25, 0.0], [0.0, 1.0, 0.0], [0.25, 0.0, 0.75]])
 
 
 def test_names_follow_the_greater_overlap():
@@ -176,9 +176,9 @@ def test_names_stay_from_origin_to_origin():
 
 def test_values_are_checked():
     with pytest.raises(ValueError, match="sum to one"):
-        Associations(np.zeros((2, 1), dtype=np.int64), np.array([0.5, 0.6]), 1)
+        AssociationHypotheses(np.zeros((2, 1), dtype=np.int64), np.array([0.5, 0.6]), 1)
     with pytest.raises(ValueError, match=r"\[-1, 1\)"):
-        Associations(np.ones((1, 1), dtype=np.int64), np.ones(1), 1)
+        AssociationHypotheses(np.ones((1, 1), dtype=np.int64), np.ones(1), 1)
     with pytest.raises(ValueError, match="not decrease"):
         Stream(np.array([1.0, 0.0]), np.zeros((2, 2)), np.zeros((2, 2, 2)))
     for wrong in ({"num_agents": 0}, {"num_particles": 0}, {"clutter_share": 1.0}):

@@ -1,4 +1,4 @@
-"""The filter against what can be computed without it: all ways to read a short stream, and the bank's Kalman filter."""
+"""The filter against what can be computed without it: all hypotheses of a short stream, and the bank's Kalman filter."""
 
 import dataclasses
 import itertools
@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from cadence.association.history import Step, drawn_ways, grouped, recently, step_of
+from cadence.association.history import Step, drawn_associations, grouped, recently, step_of
 from cadence.association.motion import Modes, motion
 from cadence.association.particles import Stream, continuations, follow
 from cadence.association.presence import Habits, left_by, log_hazards, log_silence, log_silence_between
@@ -52,17 +52,17 @@ def labellings(num, most):
 
 
 def labels(particles):
-    """One way of each particle: the only one where it remembers all detections."""
-    return particles.ways(np.arange(len(particles.weight)), np.random.default_rng(0))
+    """One hypothesis of each particle: the only one where it remembers all detections."""
+    return particles.associations(np.arange(len(particles.weight)), np.random.default_rng(0))
 
 
 @pytest.mark.parametrize(("num_agents", "leave_hz"), [(2, 0.0), (None, 0.002)])
 def test_enough_particles_are_the_exact_law_of_all_labellings(num_agents, leave_hz):
     seen, about = stream(5), habits(num_agents, leave_hz)
-    ways = list(labellings(5, num_agents or 5))
-    exact = np.array([forced(way, seen, about) for way in ways])
+    every = list(labellings(5, num_agents or 5))
+    exact = np.array([forced(label, seen, about) for label in every])
     *_, last = follow(seen, about, 10_000, seed=0, num_recent=5)
-    law = dict(zip(ways, np.exp(exact - np.logaddexp.reduce(exact)), strict=True))
+    law = dict(zip(every, np.exp(exact - np.logaddexp.reduce(exact)), strict=True))
     np.testing.assert_allclose(last.log_evidence, np.logaddexp.reduce(exact), atol=1e-4)
     for label, weight in zip(labels(last), last.weight, strict=True):
         np.testing.assert_allclose(weight, law[tuple(label.tolist())], atol=1e-4)
@@ -92,7 +92,7 @@ def test_ways_of_like_future_are_one_and_keep_their_pasts():
     for num_recent in (38, 6):
         *_, last = follow(seen, about, 3000, seed=0, num_recent=num_recent)
         particle = np.random.default_rng(1).choice(len(last.weight), 4000, p=last.weight)
-        label = last.ways(particle, np.random.default_rng(2))
+        label = last.associations(particle, np.random.default_rng(2))
         share.append((label[:, -8] == label[:, 0]).mean())
         num.append(len(last.weight))
     assert 0.05 < share[0] < 0.95
@@ -101,21 +101,21 @@ def test_ways_of_like_future_are_one_and_keep_their_pasts():
 
 
 def test_pasts_are_drawn_by_their_shares_under_the_childs_names():
-    """Two detections; the two ways after the second differ in who is who and become one particle of weights 3 to 1."""
+    """Two detections; the two hypotheses after the second differ in who is who and become one particle of weights 3 to 1."""
     parts = [np.array([0, 1]), np.array([3.0, 1.0]), np.array([0, 1])]
     recent = recently(np.array([[[0], [1]], [[1], [0]]]), np.array([0, 1]), 2)  # both: detection 2 where 0 was, 1 elsewhere
     group, order = grouped(recent)
     assert group.tolist() == [0, 0]
-    step, way = step_of(parts[1], parts[0], parts[2], group, order, np.array([0]))
-    assert way.tolist() == [0]
+    step, heaviest = step_of(parts[1], parts[0], parts[2], group, order, np.array([0]))
+    assert heaviest.tolist() == [0]
     first = [
         step_of(np.ones(1), np.array([0]), np.array([0]), np.array([0]), np.array([[0, 1]]), np.array([0]))[0],
         Step(np.array([0, 1]), np.array([0, 0]), np.ones(2), np.array([1, 1]), np.array([0, 1]), np.array([[0, 1], [1, 0]])),
     ]
-    label = drawn_ways([*first, step], np.zeros(4000, dtype=np.int64), np.random.default_rng(0))
+    label = drawn_associations([*first, step], np.zeros(4000, dtype=np.int64), np.random.default_rng(0))
     np.testing.assert_array_equal(label[:, 2], 0)
-    ways, count = np.unique(label, axis=0, return_counts=True)
-    assert len(ways) == 2
+    different, count = np.unique(label, axis=0, return_counts=True)
+    assert len(different) == 2
     np.testing.assert_allclose(np.sort(count) / 4000, [0.25, 0.75], atol=0.03)
 
 

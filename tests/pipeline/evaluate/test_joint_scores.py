@@ -11,7 +11,7 @@ import pytest
 import torch
 from fixtures.unknown_origin import CONFIG, START_NS, SWAPPED, TRUE, detections, mission
 
-from cadence.association.types import Associations
+from cadence.association.types import AssociationHypotheses
 from cadence.types import Detections, HypothesisSet, WindowBatch
 from pipeline import associations
 from pipeline.evaluate.joint import JOINT_METRICS, JointScorer
@@ -128,13 +128,13 @@ def truth(*ships: tuple[str, float]) -> pa.Table:
     return pa.Table.from_pylist(rows, schema=TRUTH)
 
 
-def two_ways(time_s, position_m, covariance_m2, origins_s, config, seed, habits=None) -> list[Associations]:
+def two_associations(time_s, position_m, covariance_m2, origins_s, config, seed, habits=None) -> list[AssociationHypotheses]:
     label = np.stack([TRUE, SWAPPED])
-    return [Associations(label[:, : int((time_s <= origin).sum())], np.array([0.75, 0.25]), 2) for origin in origins_s]
+    return [AssociationHypotheses(label[:, : int((time_s <= origin).sum())], np.array([0.75, 0.25]), 2) for origin in origins_s]
 
 
 def test_unknown_origin_is_scored_against_the_truth(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(associations, "associate", two_ways)
+    monkeypatch.setattr(associations, "associate", two_associations)
     monkeypatch.setattr(associations, "fit_habits", lambda *_: None)
     directory = mission(tmp_path, detections())
     infer(directory, CONFIG, QUIET)
@@ -143,7 +143,7 @@ def test_unknown_origin_is_scored_against_the_truth(tmp_path: Path, monkeypatch:
     scored = score_mission(directory, config, QUIET)
     assert scored.agent_ids == ("ship", "tug") and scored.is_matched
     assert len({len(cells) for cells in scored.cells.values()}) == 1 and set(scored.cells["cadence"].agent) == {0, 1}
-    # rivals see the likeliest way, which is right: the bank is near the truth for both
+    # rivals see the likeliest association, which is right: the bank is near the truth for both
     assert scored.cells["bank"].column("mean_error_m")[scored.cells["bank"].step <= 0].mean() < 10.0
     evaluate(directory, config, QUIET)
     report = json.loads((directory / "scores.json").read_text())

@@ -1,4 +1,4 @@
-"""Detections of unknown origin through infer: ways to read them, hypotheses under each way, tables, known beside unknown."""
+"""Detections of unknown origin through infer: associations, tracks under each, tables, known beside unknown."""
 
 import dataclasses
 from pathlib import Path
@@ -22,16 +22,16 @@ from fixtures.unknown_origin import (
     mission,
 )
 
-from cadence.association.types import AssociationConfig, Associations
+from cadence.association.types import AssociationConfig, AssociationHypotheses
 from cadence.constraints.obstacles import Obstacles
 from cadence.diffusion.absolute import AbsoluteSampling
 from cadence.errors import InputError
 from cadence.types import Detections, HypothesisSet, WindowBatch
 from pipeline import associations
-from pipeline.associations import Association, WayWindows, build_way_windows, shared_out, tell_sources
+from pipeline.associations import AssociatedWindows, DataAssociation, build_associated_windows, shared_out, tell_sources
 from pipeline.export.stage import ExportConfig, export
 from pipeline.infer.config import InferConfig
-from pipeline.infer.draws import draw_ways
+from pipeline.infer.draws import draw_associations
 from pipeline.infer.stage import infer
 from pipeline.logs.reader import open_log
 from pipeline.progress import Progress
@@ -46,21 +46,21 @@ from schemas.tables import ASSOCIATIONS, LABELS
 QUIET = Progress(quiet=True)
 
 
-def three_ways(time_s, position_m, covariance_m2, origins_s, config, seed, habits=None) -> list[Associations]:
+def three_associations(time_s, position_m, covariance_m2, origins_s, config, seed, habits=None) -> list[AssociationHypotheses]:
     """The truth; one detection given to the other agent; one taken for clutter."""
     label = np.stack([TRUE, SWAPPED, CLUTTERED])[:, : len(time_s)]
-    return [Associations(label[:, : int((time_s <= origin).sum())], WEIGHT, 2) for origin in origins_s]
+    return [AssociationHypotheses(label[:, : int((time_s <= origin).sum())], WEIGHT, 2) for origin in origins_s]
 
 
 @pytest.fixture
 def stand_in(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(associations, "associate", three_ways)
+    monkeypatch.setattr(associations, "associate", three_associations)
     monkeypatch.setattr(associations, "fit_habits", lambda *_: None)
 
 
-def ways_of(table: pa.Table, num_hypotheses: int = 8) -> WayWindows:
+def associated(table: pa.Table, num_hypotheses: int = 8) -> AssociatedWindows:
     sources = tell_sources(table, GRID, AssociationConfig(), 0)
-    return build_way_windows(table, sources, 0, num_hypotheses)
+    return build_associated_windows(table, sources, 0, num_hypotheses)
 
 
 def test_hypotheses_are_shared_out_by_weight() -> None:
@@ -74,12 +74,12 @@ def test_hypotheses_are_shared_out_by_weight() -> None:
 
 
 @pytest.mark.usefixtures("stand_in")
-def test_tracks_that_ways_share_are_drawn_once() -> None:
-    ways = ways_of(detections())
-    assert ways.windows.agent_ids == ("a0", "a1") and ways.windows.batch.num_windows == 2
-    windows, column = ways.tracks(slice(0, 2))
-    # at the first origin all ways agree; at the second there are two readings of a0 (with and without detection 14) and
-    # three of a1 (with 14, without 15, and as it was)
+def test_tracks_that_associations_share_are_drawn_once() -> None:
+    found = associated(detections())
+    assert found.windows.agent_ids == ("a0", "a1") and found.windows.batch.num_windows == 2
+    windows, column = found.tracks(slice(0, 2))
+    # at the first origin all associations agree; at the second a0 has two tracks (with and without detection 14) and a1 three
+    # (with 14, without 15, and as it was)
     assert windows.batch.is_active.sum(1).tolist() == [2, 5]
     assert column.shape == (2, 8, 2) and bool((column >= 0).all())
     assert len(column[0].unique(dim=0)) == 1 and column[1].unique(dim=0, return_counts=True)[1].sum() == 8
@@ -89,9 +89,9 @@ def test_tracks_that_ways_share_are_drawn_once() -> None:
 
 
 @pytest.mark.usefixtures("stand_in")
-def test_every_way_is_a_window_for_estimators_of_several_agents() -> None:
-    ways = ways_of(detections())
-    windows, window, count = ways.ways(slice(0, 2))
+def test_every_association_is_a_window_for_estimators_of_several_agents() -> None:
+    found = associated(detections())
+    windows, window, count = found.by_association(slice(0, 2))
     assert window.tolist() == [0, 0, 0, 1, 1, 1] and count.tolist() == [4, 3, 1, 4, 3, 1]
     assert windows.batch.detections.count[3:].tolist() == [[4, 4], [3, 5], [4, 3]]
     assert len(set(windows.batch.seeds.tolist())) == 6
@@ -113,9 +113,9 @@ def test_every_way_is_a_window_for_estimators_of_several_agents() -> None:
             weight = torch.full((batch.num_windows, size), 1.0 / size)
             return HypothesisSet(position, weight, (("ok", "ok"),) * batch.num_windows)
 
-    start_ns = int(ways.windows.origins_ns[1]) - 10**9
-    located = ways.located(start_ns, Obstacles.none())
-    ((part, position, weight, status),) = draw_ways(Counting(), located, 8)
+    start_ns = int(found.windows.origins_ns[1]) - 10**9
+    located = found.located(start_ns, Obstacles.none())
+    ((part, position, weight, status),) = draw_associations(Counting(), located, 8)
     assert part.tolist() == [0, 1] and status == [["ok", "ok"], ["ok", "ok"]]
     torch.testing.assert_close(weight, torch.full((2, 8), 0.125, dtype=torch.float64))
     assert position[1, :, 0, 0, 0].tolist() == [1.0] * 8
@@ -124,10 +124,10 @@ def test_every_way_is_a_window_for_estimators_of_several_agents() -> None:
 
 
 @pytest.mark.usefixtures("stand_in")
-def test_hypotheses_pass_through_the_detections_of_their_way(tmp_path: Path) -> None:
+def test_hypotheses_pass_through_the_detections_of_their_association(tmp_path: Path) -> None:
     directory = mission(tmp_path, detections())
     result = infer(directory, CONFIG, QUIET)
-    assert result.summary["association"] == {"num_detections": 16, "num_agents": 2, "mean_num_ways": 3.0}
+    assert result.summary["association"] == {"num_detections": 16, "num_agents": 2, "mean_num_associations": 3.0}
     last = read_hypothesis_tables(directory).windows[-1]
     assert [agent.agent_id for agent in last.agents] == ["a0", "a1"] and last.weight.sum() == pytest.approx(1.0)
     # detection 14 lies at 58 s, y = 0 m; the origin of the second window at 64 s, three steps later
@@ -159,9 +159,9 @@ def test_table_of_associations(tmp_path: Path) -> None:
 
 
 def test_an_agent_may_be_missing_from_a_hypothesis(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def associate(time_s, position_m, covariance_m2, origins_s, config, seed, habits=None) -> list[Associations]:
+    def associate(time_s, position_m, covariance_m2, origins_s, config, seed, habits=None) -> list[AssociationHypotheses]:
         label = np.stack([TRUE, np.where(TRUE == 1, -1, 0)])
-        return [Associations(label[:, : int((time_s <= o).sum())], np.array([0.75, 0.25]), 3) for o in origins_s]
+        return [AssociationHypotheses(label[:, : int((time_s <= o).sum())], np.array([0.75, 0.25]), 3) for o in origins_s]
 
     monkeypatch.setattr(associations, "associate", associate)
     monkeypatch.setattr(associations, "fit_habits", lambda *_: None)
@@ -191,8 +191,8 @@ def test_named_agents_stay_what_they_are(tmp_path: Path) -> None:
 
 
 def test_all_of_it_clutter_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def associate(time_s, position_m, covariance_m2, origins_s, config, seed, habits=None) -> list[Associations]:
-        return [Associations(np.full((1, int((time_s <= o).sum())), -1), np.ones(1), 0) for o in origins_s]
+    def associate(time_s, position_m, covariance_m2, origins_s, config, seed, habits=None) -> list[AssociationHypotheses]:
+        return [AssociationHypotheses(np.full((1, int((time_s <= o).sum())), -1), np.ones(1), 0) for o in origins_s]
 
     monkeypatch.setattr(associations, "associate", associate)
     monkeypatch.setattr(associations, "fit_habits", lambda *_: None)
@@ -222,9 +222,9 @@ def test_side_file_and_page_tell_of_agents_and_sources(tmp_path: Path, monkeypat
     table = table.set_column(column, table.schema.field(column), pa.nulls(len(true), pa.string()))
     write_table(table, directory / "detections.parquet", "detections", frame)
 
-    def associate(time_s, position_m, covariance_m2, origins_s, config, seed, habits=None) -> list[Associations]:
+    def associate(time_s, position_m, covariance_m2, origins_s, config, seed, habits=None) -> list[AssociationHypotheses]:
         label = np.stack([true, np.where(np.arange(len(true)) % 5 == 0, -1, true), np.where(true == 1, -1, true)])
-        return [Associations(label[:, : int((time_s <= o).sum())], np.array([0.5, 0.25, 0.25]), 2) for o in origins_s]
+        return [AssociationHypotheses(label[:, : int((time_s <= o).sum())], np.array([0.5, 0.25, 0.25]), 2) for o in origins_s]
 
     monkeypatch.setattr(associations, "associate", associate)
     monkeypatch.setattr(associations, "fit_habits", lambda *_: None)
@@ -268,10 +268,11 @@ def slow(table: pa.Table) -> pa.Table:
 
 @pytest.mark.usefixtures("stand_in")
 @pytest.mark.parametrize("preset", ["paper", "place"])
-def test_presets_that_know_a_place_draw_every_way(tmp_path: Path, preset: str) -> None:
+def test_presets_that_know_a_place_draw_every_association(tmp_path: Path, preset: str) -> None:
     directory = mission(tmp_path, slow(detections()))
     weights = "prison" if preset == "place" else str(checkpoint(tmp_path / "small.safetensors"))
-    config = InferConfig(num_hypotheses=8, checkpoint=weights, device="cpu", grid=GridConfig(stride_steps=32))
+    grid = GridConfig(stride_steps=32)
+    config = InferConfig(num_hypotheses=8, checkpoint=weights, device="cpu", is_tested=False, grid=grid)
     if preset == "paper":
         config = dataclasses.replace(config, paper=AbsoluteSampling(sampler="dpmpp", num_steps=2))
     result = infer(directory, config, QUIET)
@@ -282,7 +283,7 @@ def test_presets_that_know_a_place_draw_every_way(tmp_path: Path, preset: str) -
 
 
 @pytest.mark.usefixtures("stand_in")
-def test_labels_bring_the_likeliest_way_back(tmp_path: Path) -> None:
+def test_labels_bring_the_likeliest_association_back(tmp_path: Path) -> None:
     names: list[str | None] = [None] * 12 + ["wolf"] * 4
     table = detections(names)
     directory = mission(tmp_path, table)
@@ -292,8 +293,8 @@ def test_labels_bring_the_likeliest_way_back(tmp_path: Path) -> None:
     assert labels["window"].to_pylist() == [0] * 7 + [1] * 12 and labels.schema.equals(LABELS)
     sources = tell_sources(table, GRID, AssociationConfig(), 0)
     assert sources.association is not None
-    back = Association.of_labels(table, labels, sources.grid)
+    back = DataAssociation.of_labels(table, labels, sources.grid)
     assert back.named(table).equals(sources.named) and back.agent_ids == ("a0", "a1")
-    for ours, theirs in zip(back.ways, sources.association.ways, strict=True):
+    for ours, theirs in zip(back.at_origins, sources.association.at_origins, strict=True):
         held = ours.label[0] != -1
         assert held.any() and np.array_equal(ours.label[0, held], theirs.label[0, held])
