@@ -70,6 +70,7 @@ def _identified(rows: Positions, readers: Sequence[ChannelReader], tolerance_s: 
     naming = Naming(
         believed={reader.channel.topic for reader in of_detections if reader.source.has_identity},
         topical={reader.channel.topic for reader in of_detections if reader.names["agent"] is not None},
+        stated={reader.channel.topic for reader in of_detections if reader.is_stated and reader.source.agent_path is not None},
     )
     suggested = {reader.channel.topic: reader.channel.schema_name for reader in of_detections if not reader.is_stated}
     rows = without_false_names(rows, tolerance_s, naming, suspicions)

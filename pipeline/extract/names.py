@@ -40,10 +40,12 @@ class Naming:
 
     believed  topics whose names are not
     topical   topics that state the name themselves: only that one message gives it to several places
+    stated    topics of which the user says where the name is: a kind of target may be the name of the only one of its kind
     """
 
     believed: Collection[str]
     topical: Collection[str]
+    stated: Collection[str] = ()
 
 
 def without_false_names(rows: Positions, tolerance_s: float, naming: Naming, suspicions: Suspicions) -> Positions:
@@ -59,18 +61,18 @@ def without_false_names(rows: Positions, tolerance_s: float, naming: Naming, sus
         if topic in naming.believed or topic in naming.topical:
             continue
         chosen = of_topic[rows.agents.number[of_topic] >= 0]
-        for is_false, seen in _faults(rows[chosen]):
+        for is_false, seen in _faults(rows[chosen], topic in naming.stated):
             agent[chosen[is_false]] = None
             _suspect(topic, seen, int(is_false.sum()), suspicions)
     return rows if (agent == rows.agent).all() else replace(rows, agent=agent)
 
 
-def _faults(rows: Positions) -> Iterator[tuple[Bools, str]]:
+def _faults(rows: Positions, is_stated: bool) -> Iterator[tuple[Bools, str]]:
     """Which rows [N] of a topic bear no name, and why, for each reason that there is."""
     names = rows.agents.names
     for is_chosen, why in (
         ([_is_fill_in(name) for name in names], "what stands where nothing was filled in"),
-        ([name.lower() in _CLASSES for name in names], "what was seen, not who"),
+        ([not is_stated and name.lower() in _CLASSES for name in names], "what was seen, not who"),
     ):
         chosen = list(itertools.compress(names, is_chosen))
         if chosen:

@@ -30,6 +30,9 @@ _MAX_BIAS_M: Final = 50.0
 _MAX_GAPS: Final = 3.0
 """Of the usual step of a track: over a longer gap nobody knows where it was."""
 _MIN_ROWS: Final = 3
+_MAX_LAG: Final = 8
+_MAX_LATE_RATIO: Final = 10.0
+"""Of a step that leads far away to where it leads back: chance does so in one of a hundred."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,20 +108,48 @@ def odd_share(track: Track, tolerance_s: float, of_interest: float = 0.0) -> flo
     if len(track) < _MIN_ROWS:
         return 0.0
     step_s, step_m = np.diff(track.time_s), np.abs(np.diff(track.place))
-    back_m, leg_m = np.abs(track.place[2:] - track.place[:-2]), np.minimum(step_m[:-1], step_m[1:])
-    is_return, is_double = leg_m > _MAX_RATIO * back_m, (step_s <= tolerance_s) & (step_m > 0)
-    if is_return.sum() + is_double.sum() <= of_interest * len(step_s):
+    is_double, least = (step_s <= tolerance_s) & (step_m > 0), of_interest * len(step_s)
+    is_return = _begin_returns(track, step_m, 2)
+    lags = range(3, _MAX_LAG + 1) if (step_m > _MIN_JUMP_M).sum() > least else ()
+    if is_return.sum() + is_double.sum() <= least and not lags:
         return 0.0
     sigma_m = np.sqrt(track.variance_m2[1:] + track.variance_m2[:-1])
-    is_return &= leg_m > _SIGMAS * np.maximum(sigma_m[:-1], sigma_m[1:])
-    back_s = track.time_s[2:] - track.time_s[:-2]
-    speed_mps = np.divide(back_m, back_s, out=np.zeros(len(back_s)), where=back_s > 0)
-    for way_m, way_s in ((step_m[:-1], step_s[:-1]), (step_m[1:], step_s[1:])):
-        is_return &= (way_s > tolerance_s) & (4 * (way_m - speed_mps * way_s) > _MAX_ACCELERATION_MPS2 * way_s**2)
+    is_odd = _are_forced(track, sigma_m, is_return, 2, tolerance_s)
+    for lag in lags:
+        is_odd |= _are_forced(track, sigma_m, _begin_returns(track, step_m, lag), lag, tolerance_s)
     moments = track[np.diff(track.time_s, prepend=-np.inf) > tolerance_s]
     allowed_m = max(_STEPS * moments.step_m(), _SCATTERS * moments.scatter_m())
     is_double &= step_m > np.maximum(_SIGMAS * sigma_m, allowed_m)
-    return float(is_return.sum() + is_double.sum()) / len(step_s)
+    return float(is_odd.sum() + is_double.sum()) / len(step_s)
+
+
+def _begin_returns(track: Track, step_m: Float64s, lag: int) -> Bools:
+    """Which steps [N - 1] lead away from where the track is again, `lag` rows later; after more than two only far ones."""
+    found = np.zeros(len(step_m), np.bool_)
+    if len(step_m) < lag:
+        return found
+    leg_m = np.minimum(step_m[: len(step_m) - lag + 1], step_m[lag - 1 :])
+    back_m = np.abs(track.place[lag:] - track.place[:-lag])
+    is_near = leg_m > (_MAX_RATIO if lag == 2 else _MAX_LATE_RATIO) * back_m
+    found[: len(leg_m)] = is_near if lag == 2 else is_near & (leg_m > _MIN_JUMP_M)
+    return found
+
+
+def _are_forced(track: Track, sigma_m: Float64s, is_return: Bools, lag: int, tolerance_s: float) -> Bools:
+    """Which of the steps [N - 1] that begin a return nothing makes that moves as it does around it, nor those that end it."""
+    begin = np.flatnonzero(is_return)
+    found = np.zeros(len(is_return), np.bool_)
+    if not len(begin):
+        return found
+    back_m, back_s = np.abs(track.place[begin + lag] - track.place[begin]), track.time_s[begin + lag] - track.time_s[begin]
+    speed_mps = np.divide(back_m, back_s, out=np.zeros(len(begin)), where=back_s > 0)
+    is_forced = np.ones(len(begin), np.bool_)
+    for step in (begin, begin + lag - 1):
+        way_m, way_s = np.abs(track.place[step + 1] - track.place[step]), track.time_s[step + 1] - track.time_s[step]
+        is_forced &= (way_s > tolerance_s) & (4 * (way_m - speed_mps * way_s) > _MAX_ACCELERATION_MPS2 * way_s**2)
+        is_forced &= way_m > _SIGMAS * sigma_m[step]
+    found[begin[is_forced]] = True
+    return found
 
 
 def pieces_of(track: Track, tolerance_s: float) -> tuple[Int64s, Jump | None]:

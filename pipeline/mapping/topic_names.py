@@ -22,13 +22,21 @@ _STAGES: Final = {
     "output", "out", "input", "in", "result", "results", "list", "array", "all", "data", "msg", "msgs", "info", "state",
     "states", "status", "point", "points", "box", "boxes", "bbox", "marker", "markers", "stamped", "covariance", "cov",
     "with", "global", "local", "world", "map", "enu", "ned", "ecef", "utm", "final", "new", "debug", "viz", "visualization",
-    "latest", "update", "updates", "history", "online", "offline", "sim", "current",
+    "latest", "update", "updates", "history", "online", "offline", "sim", "current", "unfiltered", "smooth", "smoothing",
+    "stabilized", "stabilised", "dedup", "deduplicated", "nms", "gated", "gating", "associated", "association", "compensated",
+    "calibrated", "rectified", "aligned", "projected", "interpolated", "resampled", "downsampled", "refined", "selected", "sorted",
+    "clean", "cleaned", "decoded", "parsed", "converted", "annotated", "labeled", "labelled", "valid", "invalid", "active",
+    "candidate", "candidates", "hypothesis", "hypotheses", "stage", "step", "level", "model", "network", "inference",
+    "kalman", "ekf", "ukf", "imm", "jpda", "gnn", "mht", "sort", "deepsort", "bytetrack", "yolo", "yolov", "ssd", "rcnn",
+    "centerpoint", "pointpillars", "stream", "feed", "published", "publisher", "replay", "recorded", "simulated", "synthetic",
+    "test", "main", "primary", "secondary", "default", "full", "partial", "best", "measured", "observed", "fov", "roi",
 }  # fmt: skip
 """Words for a step of work on detections, or for their form: a part of a name that has no others is no name."""
 _SENSORS: Final = {
     "lidar", "laser", "camera", "cam", "rgb", "rgbd", "thermal", "infrared", "ir", "eo", "eoir", "sonar", "radar", "ars", "esr",
     "srr", "mrr", "lrr", "velodyne", "ouster", "livox", "realsense", "zed", "stereo", "mono", "depth", "front", "rear", "back",
     "left", "right", "center", "centre", "middle", "top", "bottom", "forward", "port", "starboard", "bow", "stern", "mast",
+    "flir", "lwir", "swir", "nir", "uv", "acoustic", "hydrophone", "ladar", "hesai", "robosense", "v2x",
 }  # fmt: skip
 """Words for who saw, or for where on a vehicle that is: the name of a sensor, wherever it stands."""
 
@@ -42,7 +50,7 @@ def words_of(topic: str) -> list[str]:
 _LOOKS: Final = {
     "contact", "contacts", "detection", "detections", "detected", "track", "tracks", "target", "targets", "sighting",
     "sightings", "observation", "observations", "measurement", "measurements", "report", "reports", "pose", "poses", "position",
-    "positions", "location",
+    "positions", "location", "det", "dets", "obs", "meas",
 }  # fmt: skip
 """Words that say only that something is somewhere."""
 

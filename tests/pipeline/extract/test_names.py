@@ -87,3 +87,13 @@ def test_names_that_are_new_in_each_message_are_none() -> None:
 
 def test_nothing_at_all_is_no_suspicion() -> None:
     assert judged(rows()[:0]) == ([], []) and np.size(rows((1, 0.0, 1.0, 1.0, "T")).agent) == 1
+
+
+def test_kinds_are_names_where_the_user_says_so_and_each_is_one_target() -> None:
+    alone = [(i, float(i), 2.0 * i, y, name) for i in range(20) for y, name in ((0.0, "boat"), (90.0, "car"))]
+    naming = Naming(set(), set(), stated={"/seen"})
+    suspicions = Suspicions()
+    assert without_false_names(rows(*alone), 0.001, naming, suspicions).agent.tolist() == ["boat", "car"] * 20
+    assert not suspicions and judged(rows(*alone))[0] == [None] * 40
+    shared = [(i, float(i), 2.0 * i, y, "boat") for i in range(20) for y in (0.0, 90.0)]
+    assert without_false_names(rows(*shared), 0.001, naming, suspicions).agent.tolist() == [None] * 40

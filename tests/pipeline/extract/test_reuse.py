@@ -52,6 +52,21 @@ def test_two_targets_that_take_turns_are_nobody() -> None:
     assert named(rows(*at_once))[0] == [None] * 40
 
 
+def test_numbers_of_places_in_a_list_are_nobody() -> None:
+    """Of three targets that stand in another order in each message, or of which each message tells one."""
+    rng = np.random.default_rng(0)
+    mixed = [(i, float(i), 5.0 * i, 300.0 * k, str(name)) for i in range(60) for name, k in enumerate(rng.permutation(3))]
+    names, (line,) = named(rows(*mixed))
+    assert names == [None] * 180 and '"0", "1", "2" would be at several places at once' in line
+    assert named(rows(*[(i, float(i), 5.0 * i, 300.0 * (i % 3), "0") for i in range(60)]))[0] == [None] * 60
+
+
+@pytest.mark.parametrize("sigma_m", [150.0, 600.0])
+def test_one_target_that_is_seen_badly_keeps_its_name(sigma_m: float) -> None:
+    place_m = np.random.default_rng(0).normal(0.0, sigma_m, (200, 2))
+    assert named(rows(*[(i, float(i), *place, "7") for i, place in enumerate(place_m.tolist())]))[0].count(None) == 0
+
+
 @pytest.mark.parametrize("y_m", [300.0, 100.0])
 def test_sensors_that_count_for_themselves(y_m: float) -> None:
     left, right = rows(*car(0, 29, 0, 0, 10), topic="/left/tracks"), rows(*car(0.2, 29.2, 0, y_m, 10), topic="/right/tracks")
