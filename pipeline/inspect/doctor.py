@@ -38,6 +38,7 @@ _LEFT_OUT = {
 _ADVICE = {
     "copy": "If there is another copy of the recording, use that one: what is lost here may be whole there.",
     "as it is": "`cadence run` works on the damaged log as it is: it takes what is sound, and lost spans are gaps.",
+    "joined": "Keep each recording as a file of its own: most tools find only one of those that were joined to one file.",
     "recorder": "Let the recorder write checksums and an index (most do unless told otherwise), and end it in good order.",
     "clock": "Check the recorder's clock; a source with time = \"publish_time\" or a stamp's path uses another one.",
     "suspicion": "Look at what is suspected, and state the setting that it names: then it is as you say.",
@@ -153,10 +154,12 @@ def _of(name: str, log: MissionLog) -> Diagnosis:
     use, no_use = _use_of(log)
     suspicions = tuple(suspicions_in(use))
     verdict: Verdict = "partial" if not health.is_complete else "faulty" if health.problems else "sound"
+    is_joined = log.num_recordings > len(log.parts)
     reasons = {
         "copy": not health.is_complete,
         "as it is": not health.is_complete and not no_use,
-        "recorder": bool(container) or bool(health.problems and health.is_complete),
+        "joined": is_joined,
+        "recorder": bool(container) or bool(health.problems and health.is_complete and not is_joined),
         "clock": bool(times.clocks),
         "schema": bool(undecodable),
         "suspicion": bool(suspicions),

@@ -53,6 +53,11 @@ class MissionLog:
         return tuple(dict.fromkeys(source.path for source in self._sources))
 
     @property
+    def num_recordings(self) -> int:
+        """How many recordings its files hold; more than files where some were joined, one behind the other."""
+        return len(self._sources)
+
+    @property
     def name(self) -> str:
         """What the mission is called: the stem of its file, or what the names of its parts have in common."""
         return mission_name(self.parts or (self.path,))

@@ -24,7 +24,7 @@ _STAGES: Final = {
     "with", "global", "local", "world", "map", "enu", "ned", "ecef", "utm", "final", "new", "debug", "viz", "visualization",
     "latest", "update", "updates", "history", "online", "offline", "sim", "current", "unfiltered", "smooth", "smoothing",
     "stabilized", "stabilised", "dedup", "deduplicated", "nms", "gated", "gating", "associated", "association", "compensated",
-    "calibrated", "rectified", "aligned", "projected", "interpolated", "resampled", "downsampled", "refined", "selected", "sorted",
+    "calibrated", "rectified", "aligned", "projected", "interpolated", "resampled", "downsampled", "refined", "selected",
     "clean", "cleaned", "decoded", "parsed", "converted", "annotated", "labeled", "labelled", "valid", "invalid", "active",
     "candidate", "candidates", "hypothesis", "hypotheses", "stage", "step", "level", "model", "network", "inference",
     "kalman", "ekf", "ukf", "imm", "jpda", "gnn", "mht", "sort", "deepsort", "bytetrack", "yolo", "yolov", "ssd", "rcnn",

@@ -120,6 +120,12 @@ def test_a_missing_log_does_not_stop_the_others(tmp_path: Path) -> None:
     assert (gone.verdict, found.verdict) == ("unusable", "sound") and "not found" in gone.problems[0]
 
 
+def test_joined_recordings_are_named_with_what_to_do(examined: Callable[[bytes], Diagnosis]) -> None:
+    found = examined(recording() * 2)
+    assert found.verdict == "faulty" and "holds 2 recordings" in found.problems[0]
+    assert [advice for advice in found.advice if "file of its own" in advice] and not any("end it" in it for it in found.advice)
+
+
 def test_an_unusable_log_counts_more_than_a_partial_one(examined: Callable[[bytes], Diagnosis]) -> None:
     whole = recording()
     partial, unusable, sound = examined(whole[: len(whole) // 2]), examined(b""), examined(whole)
