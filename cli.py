@@ -241,7 +241,7 @@ def export(
     Example:
       cadence export results/flight --combined
     """
-    from pipeline.export.stage import ExportConfig
+    from pipeline.export.config import ExportConfig
     from pipeline.export.stage import export as stage
 
     resolved = stage_config(ExportConfig, "export", config, [*(settings or ()), *_COMBINED * combined])

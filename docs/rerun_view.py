@@ -70,7 +70,7 @@ def log_entity(path: str, entity: SceneEntity, static: bool) -> None:
 
 
 def strips_of(line: LinePrimitive) -> Iterable[list[tuple[float, float, float]]]:
-    """What Rerun draws as one strip: a whole line, a closed one, or the pieces of a dashed one."""
+    """What Rerun draws as one strip: a whole line, a closed one, or the pieces of a list."""
     points = [(point.x, point.y, point.z) for point in line.points]
     if line.type == LinePrimitive.LINE_LIST:
         return [points[i : i + 2] for i in range(0, len(points), 2)]
@@ -106,8 +106,9 @@ def main() -> int:
     parser.add_argument("--until", type=float, default=1.0, help="the part of the mission whose scenes are drawn (0 to 1)")
     arguments = parser.parse_args()
     side = open_log(arguments.side)
-    scenes = read_scenes(side, channels.SCENE.topic)
-    scenes = scenes[: max(1, round(arguments.until * len(scenes)))]
+    present = read_scenes(side, channels.PRESENT.topic)
+    present = present[: max(1, round(arguments.until * len(present)))]
+    scenes = [item for item in read_scenes(side, channels.SCENE.topic) if present and item[0] <= present[-1][0]]
     rr.init("cadence", recording_id=arguments.side.stem)
     rr.save(arguments.save)
     drawn = [update for _, update in scenes if update.entities]
@@ -115,6 +116,7 @@ def main() -> int:
         rr.send_blueprint(blueprint(drawn[-1]))
     log_scenes(read_scenes(side, channels.OBSTACLES.topic), channels.OBSTACLES.topic, static=True)
     log_scenes(scenes, channels.SCENE.topic)
+    log_scenes(present, channels.PRESENT.topic)
     rr.log_file_from_path(arguments.log)
     rr.disconnect()
     return 0

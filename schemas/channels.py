@@ -26,6 +26,7 @@ class Channel:
 
 HYPOTHESES = Channel("/cadence/hypotheses", "cadence.Hypotheses")
 SCENE = Channel("/cadence/scene", "foxglove.SceneUpdate")
+PRESENT = Channel("/cadence/present", "foxglove.SceneUpdate")
 OBSTACLES = Channel("/cadence/obstacles", "foxglove.SceneUpdate")
 AGENTS = Channel("/cadence/agents", "cadence.Agents")
 OCCUPANCY = Channel("/cadence/occupancy", "foxglove.Grid")

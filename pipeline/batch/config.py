@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field
 
-from pipeline.export.stage import ExportConfig
+from pipeline.export.config import ExportConfig
 from pipeline.extract.config import ExtractConfig
 from pipeline.infer.config import InferConfig
 from pipeline.ingest.stage import IngestConfig

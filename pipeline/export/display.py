@@ -2,15 +2,18 @@
 
 import colorsys
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from pipeline.arrays import Float64s, Int64s
+from pipeline.arrays import Bools, Float64s, Int64s
+from pipeline.export import numbers
 from pipeline.export.playback import LiveAgent, Scene
 from pipeline.export.scene import Entity, Label, Lines, LineType, Spheres, round_positions
+from pipeline.export.sizes import reach_m
+from pipeline.export.vertices import visible_vertices
 from pipeline.presence import with_presence
 
 # Okabe and Ito (2008), "Color Universal Design": told apart with any colour vision; black is left out (dark backgrounds).
@@ -21,7 +24,16 @@ _SHADES = ((0.4, 1.0), (1.0, 0.95), (0.6, 0.5), (0.3, 0.75), (0.8, 0.75))
 """Saturation and value of the colours after those."""
 
 _ALPHA_FLOOR, _ALPHA_TOP = 0.10, 0.65
-_FUTURE_TINT = 0.5
+_FUTURE_TINT, _FUTURE_FADE = 0.55, 0.7
+_THIN_PX, _THICK_PX = (1.5, 1.0), (4.0, 2.5)
+"""Of hypotheses and of the central one: past and future."""
+
+_SEEN_SHARE = 1.0 / 400.0
+"""Of what an agent's hypotheses reach: two or three pixels where they fill the screen."""
+
+_LARGEST_BALL = 2.5
+"""How far the ball of an agent grows with its uncertainty, in sizes of its marks."""
+
 _OBSTACLE_COLOR = np.array([0.75, 0.75, 0.75, 0.9])
 _MAX_MARKS = 256
 _CIRCLE_POINTS = 48
@@ -47,7 +59,14 @@ class Marks:
 
 @dataclass(frozen=True)
 class Style:
-    """What the whole mission has in common: colours by agent, size, height, detail, whether origins are unknown."""
+    """What the whole mission has in common: colours by agent, sizes, height, detail.
+
+    center_m, extent_m  of all detections: where the camera looks, and from how far
+    mark_m              diameter of the marks of each agent that has hypotheses
+    plotted_ids         agents with hypotheses, those detected most first: the order in which plots take them
+    named_ids           agents whose detections say whose they are
+    uncertain_ids       agents that may not be there at all: the log does not say whose its detections are
+    """
 
     agent_ids: tuple[str, ...]
     center_m: tuple[float, float]
@@ -55,7 +74,10 @@ class Style:
     z_m: float
     num_hypotheses: int
     max_vertices: int
-    has_unknown_origin: bool = False
+    mark_m: Mapping[str, float]
+    plotted_ids: tuple[str, ...] = ()
+    named_ids: frozenset[str] = frozenset()
+    uncertain_ids: frozenset[str] = frozenset()
 
     def hue(self, agent_id: str) -> str:
         """The colour of an agent as #RRGGBB; grey for one that was never inferred."""
@@ -66,99 +88,106 @@ class Style:
         text = self.hue(agent_id)
         return np.array([*(int(text[i : i + 2], 16) / 255.0 for i in (1, 3, 5)), 1.0])
 
-    def place(self, position_m: Float64s) -> Float64s:
-        """Positions [..., 2] rounded for the eye, with the height of the scene [..., 3]."""
-        flat = round_positions(position_m, self.extent_m)
+    def size_m(self, agent_id: str) -> float:
+        """Diameter of the marks of an agent; of one that was never inferred that of a middling other."""
+        if agent_id in self.mark_m:
+            return self.mark_m[agent_id]
+        return float(np.median(list(self.mark_m.values()))) if self.mark_m else 0.005 * self.extent_m
+
+    def place(self, position_m: Float64s, reach_m: float) -> Float64s:
+        """Positions [..., 2] rounded for the eye, as part of a drawing so wide, with the height of the scene [..., 3]."""
+        flat = round_positions(position_m, reach_m)
         return np.concatenate([flat, np.full((*flat.shape[:-1], 1), self.z_m)], axis=-1)
 
 
-@dataclass(frozen=True, eq=False)
-class Drawing:
-    """What stays the same from tick to tick while a scene is shown: the lines of each live agent."""
-
-    scene: Scene
-    lines: tuple[tuple[Lines, ...], ...]
+def hypothesis_entities(scene: Scene, marks: Sequence[Marks], style: Style) -> list[Entity]:
+    """What does not change while a scene is shown: the lines of each live agent, and the detections that they rest on."""
+    entities = [Entity(f"agent/{live.agent.agent_id}", lines=_hypothesis_lines(live, style)) for live in scene.live]
+    return entities + _detections(marks, scene.start_ns, scene.origin_ns, style)
 
 
-def draw(scene: Scene, style: Style) -> Drawing:
-    """The drawing of a scene."""
-    lines = tuple(_hypothesis_lines(live, style.color(live.agent.agent_id), style) for live in scene.live)
-    return Drawing(scene, lines)
+def present_entities(scene: Scene, time_ns: int, marks: Sequence[Marks], style: Style) -> list[Entity]:
+    """What moves: where each live agent is by now, with its name, and the detections since the scene began."""
+    found = [_ball(live, time_ns, style) for live in scene.live]
+    return found + _detections(marks, scene.origin_ns + 1, time_ns, style)
 
 
-def scene_entities(drawing: Drawing | None, time_ns: int, marks: Sequence[Marks], style: Style) -> list[Entity]:
-    """Everything to be seen at a time: an entity an agent that is live, and one for each agent's detections so far."""
-    if drawing is None:
-        return []
-    scene = drawing.scene
-    entities = [_agent_entity(live, lines, time_ns, style) for live, lines in zip(scene.live, drawing.lines, strict=True)]
+def _detections(marks: Sequence[Marks], start_ns: int, end_ns: int, style: Style) -> list[Entity]:
+    """A sphere a detection from one time to another, the last ones of each agent; half as wide as its other marks."""
+    entities = []
     for found in marks:
-        first, last = np.searchsorted(found.time_ns, [scene.start_ns, time_ns + 1])
+        first, last = np.searchsorted(found.time_ns, [start_ns, end_ns + 1])
         first = max(first, last - _MAX_MARKS)
         if first < last:
-            spheres = Spheres(style.place(found.position_m[first:last]), style.extent_m * 0.008, style.color(found.agent_id))
-            entities.append(Entity(f"detections/{found.agent_id}", spheres=(spheres,)))
+            size_m = 0.5 * style.size_m(found.agent_id)
+            place_m = style.place(found.position_m[first:last], 256.0 * size_m)
+            entities.append(
+                Entity(f"detections/{found.agent_id}", spheres=(Spheres(place_m, size_m, style.color(found.agent_id)),))
+            )
     return entities
 
 
-def _agent_entity(live: LiveAgent, lines: tuple[Lines, ...], time_ns: int, style: Style) -> Entity:
-    color = style.color(live.agent.agent_id)
-    now_m = style.place(live.weight @ live.at(time_ns))
+def _ball(live: LiveAgent, time_ns: int, style: Style) -> Entity:
+    """A ball about where the central hypothesis is now, as wide as the hypotheses lie apart, within limits."""
+    size_m, color = style.size_m(live.agent.agent_id), style.color(live.agent.agent_id)
+    now_m = live.at(time_ns)
+    place_m = style.place(now_m[live.central], 256.0 * size_m)
+    wide_m = float(np.clip(2.0 * numbers.spread_m(now_m, live.weight), size_m, _LARGEST_BALL * size_m))
     called = with_presence(live.agent.agent_id, live.agent.probability)
     return Entity(
         f"agent/{live.agent.agent_id}",
-        lines=lines,
-        spheres=(Spheres(now_m[None], style.extent_m * 0.012, np.array([*color[:3], 0.8])),),
-        labels=(Label(now_m + np.array([0.0, style.extent_m * 0.015, 0.0]), called, color),),
+        spheres=(Spheres(place_m[None], wide_m, np.array([*color[:3], 0.8])),),
+        labels=(Label(place_m + np.array([0.0, 0.75 * wide_m, 0.0]), called, color),),
     )
 
 
-def _hypothesis_lines(live: LiveAgent, color: Float64s, style: Style) -> tuple[Lines, ...]:
-    """The past solid; the future in a lighter hue and dashed; the mean thicker than the hypotheses."""
-    past, future = _vertices(live.window.origin_index, live.window.num_steps, style.max_vertices)
+def _hypothesis_lines(live: LiveAgent, style: Style) -> tuple[Lines, ...]:
+    """The past in the agent's colour; the future lighter, thinner and fainter; the central hypothesis thicker than all."""
     # The heaviest ones; the order of drawing stays that of their numbers.
     chosen = np.sort(np.argsort(-live.weight, kind="stable")[: style.num_hypotheses])
-    track_m = live.position_m[chosen]
     alpha = _ALPHA_FLOOR + (_ALPHA_TOP - _ALPHA_FLOOR) * live.weight[chosen] / live.weight[chosen].max()
-    # Alpha as one of 64 levels: long runs of equal bytes compress.
-    alpha = np.round(alpha * 64.0) / 64.0
-    lighter = color.copy()
-    lighter[:3] += _FUTURE_TINT * (1.0 - color[:3])
-    groups = []
-    for steps, hue, kind in ((past, color, LineType.STRIP), (future, lighter, LineType.LIST)):
-        if len(steps) >= 2:
-            each = np.column_stack([np.tile(hue[:3], (len(chosen), 1)), alpha])
-            groups.append(Lines(style.place(_at_steps(track_m, steps)), each, 1.5, kind))
-            groups.append(Lines(style.place(_at_steps(live.mean_m[None], steps)), hue[None], 4.0, kind))
+    track_m = live.position_m[[*chosen, live.central]]
+    is_vertex = _vertices(track_m, live.window.origin_index, style.max_vertices)
+    place_m, groups = style.place(track_m, reach_m(live)), []
+    for is_future, steps in enumerate((slice(None, live.window.origin_index + 1), slice(live.window.origin_index, None))):
+        hue = style.color(live.agent.agent_id)[:3]
+        hue = hue + is_future * _FUTURE_TINT * (1.0 - hue)
+        # Alpha as one of 64 levels: long runs of equal bytes compress.
+        faint = np.round(alpha * (_FUTURE_FADE if is_future else 1.0) * 64.0) / 64.0
+        color = np.column_stack([np.tile(hue, (len(track_m), 1)), [*faint, 1.0]])
+        for rows, thickness_px in ((slice(None, -1), _THIN_PX), (slice(-1, None), _THICK_PX)):
+            groups += _lines(place_m[rows, steps], is_vertex[rows, steps], color[rows], thickness_px[is_future])
     return tuple(groups)
 
 
-def _vertices(origin_index: int, num_steps: int, max_vertices: int) -> tuple[Float64s, Float64s]:
-    """Steps (may lie between two) at which lines of the past and of the future have their points.
-
-    The future has an even number of points: it is drawn as separate dashes.
-    """
-    num_past = int(np.clip(round(max_vertices * (origin_index + 1) / num_steps), 2, origin_index + 1)) if origin_index else 0
-    room = max(2, max_vertices - num_past) // 2 * 2
-    past = np.unique(np.round(np.linspace(0, origin_index, num_past))) if num_past else np.zeros(0)
-    future = np.linspace(origin_index, num_steps - 1, room) if origin_index < num_steps - 1 else np.zeros(0)
-    return past, future
+def _vertices(track_m: Float64s, origin_index: int, max_vertices: int) -> Bools:
+    """Steps [K, T] at which lines have points: as few as nobody can tell, and no more than `max_vertices` in the mean."""
+    tolerance_m = _SEEN_SHARE * max(float(np.ptp(track_m, axis=(0, 1)).max()), 1e-3)
+    while True:
+        is_vertex = visible_vertices(track_m, origin_index, tolerance_m)
+        if is_vertex.sum(axis=1).mean() <= max_vertices:
+            return is_vertex
+        tolerance_m *= 2.0
 
 
-def _at_steps(track_m: Float64s, steps: Float64s) -> Float64s:
-    """Tracks [K, T, 2] at fractional steps [V]: [K, V, 2], linear in between."""
-    low = np.floor(steps).astype(np.intp)
-    high = np.minimum(low + 1, track_m.shape[1] - 1)
-    share = (steps - low)[:, None]
-    return np.asarray((1.0 - share) * track_m[:, low] + share * track_m[:, high])
+def _lines(place_m: Float64s, is_vertex: Bools, color: Float64s, thickness_px: float) -> list[Lines]:
+    """Lines through those steps of tracks [K, T, 3] that are vertices, in groups of as many points; none of single points."""
+    count = is_vertex.sum(axis=1)
+    groups = []
+    for num in np.unique(count[count > 1]).tolist():
+        rows = count == num
+        groups.append(Lines(place_m[rows][is_vertex[rows]].reshape(-1, num, 3), color[rows], thickness_px))
+    return groups
 
 
 def obstacle_entities(obstacles: Sequence[dict[str, Any]], style: Style) -> list[Entity]:
     """Outlines of obstacles, drawn twice (one above the other) with uprights between: to be seen from any side."""
-    height_m = style.extent_m * 0.02
     entities = []
     for number, obstacle in enumerate(obstacles):
-        outlines = [style.place(ring) for ring in _rings(obstacle)]
+        rings = _rings(obstacle)
+        wide_m = max((float(np.ptp(ring, axis=0).max()) for ring in rings), default=0.0)
+        height_m = min(0.1 * wide_m, 0.02 * style.extent_m)
+        outlines = [style.place(ring, wide_m) for ring in rings]
         groups = []
         for ring in outlines:
             roof = ring + np.array([0.0, 0.0, height_m])

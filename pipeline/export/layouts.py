@@ -15,7 +15,9 @@ from schemas import channels
 
 Json = dict[str, Any]
 
-_MAX_SERIES_AGENTS = 12
+MAX_PLOTTED = 12
+"""Agents whose series are switched on: more lines cannot be told apart."""
+
 _SCENE_TYPES = frozenset(
     {"Marker", "MarkerArray", "OccupancyGrid", "Odometry", "Path", "PointCloud", "PoseArray", "PoseInFrame", "PosesInFrame"}
     | {"PoseStamped", "PoseWithCovarianceStamped", "SceneUpdate"}
@@ -106,19 +108,19 @@ def _columns(
     left: tuple[_Panel, ...] = (scene,)
     if frame.is_georeferenced:
         left += (_Panel("Map", "map", "Map", _map_config(style, source, topics), 1.0),)
-    right: tuple[_Panel, ...] = (
-        _Panel("Plot", "Plot", "Spread (m)", _plot_config(_spread_series(style)), 1.0),
-        _Panel("Plot", "Plot", "Detections", _plot_config(_detection_series(style)), 1.0),
+    plots = [("Spread (m)", _spread_series), ("Detections", _detection_series)]
+    plots += [("Association", _association_series)] if style.uncertain_ids else []
+    few = f", {MAX_PLOTTED} of {len(style.plotted_ids)} agents" if len(style.plotted_ids) > MAX_PLOTTED else ""
+    right: tuple[_Panel, ...] = tuple(
+        _Panel("Plot", "Plot", title + few, _plot_config(series(style)), 1.0) for title, series in plots
     )
-    if style.has_unknown_origin:
-        right += (_Panel("Plot", "Plot", "Association", _plot_config(_association_series(style)), 1.0),)
     right += (_Panel("RawMessages", "RawMessages", "Agents", {"topicPath": channels.AGENTS.topic, "diffEnabled": False}, 1.0),)
     return (2.0, left), (1.0, right)
 
 
 def _scene_config(frame: Frame, style: Style, source: Sequence[CatalogueChannel], topics: Sequence[str]) -> Json:
     shown: Json = {topic: {"visible": True} for topic in _of_types(source, _SCENE_TYPES)}
-    for channel in (channels.SCENE, channels.OBSTACLES, channels.OCCUPANCY):
+    for channel in (channels.SCENE, channels.PRESENT, channels.OBSTACLES, channels.OCCUPANCY):
         if channel.topic in topics:
             shown[channel.topic] = {"visible": True}
     if channels.OCCUPANCY.topic in topics:
@@ -187,38 +189,43 @@ def _plot_config(series: Iterable[Json]) -> Json:
 
 
 def _spread_series(style: Style) -> Iterable[Json]:
-    for agent_id in style.agent_ids[:_MAX_SERIES_AGENTS]:
-        agent = f"{channels.AGENTS.topic}.agents[:]{_filter('id', agent_id)}"
-        yield _series(f"{agent}.spread_m", f"{agent_id} now", style.hue(agent_id), line_size=2)
-        yield _series(f"{agent}.horizon_spread_m", f"{agent_id} horizon", style.hue(agent_id), line_size=1)
+    for agent_id, agent in _plotted(style):
+        yield _series(style, agent_id, f"{agent}.spread_m", "now", line_size=2)
+        yield _series(style, agent_id, f"{agent}.horizon_spread_m", "horizon", line_size=1)
 
 
 def _detection_series(style: Style) -> Iterable[Json]:
     """The age of the last detection rises and falls to zero; the detections themselves are points."""
-    for agent_id in style.agent_ids[:_MAX_SERIES_AGENTS]:
-        agent = f"{channels.AGENTS.topic}.agents[:]{_filter('id', agent_id)}"
-        yield _series(f"{agent}.age_s", f"{agent_id} age (s)", style.hue(agent_id), line_size=1)
-        detection = f"{channels.DETECTIONS.topic}{_filter('agent_id', agent_id)}.num_merged"
-        yield _series(detection, f"{agent_id} detected", style.hue(agent_id), line_size=3) | {"showLine": False}
+    for agent_id, agent in _plotted(style):
+        yield _series(style, agent_id, f"{agent}.age_s", "age (s)", line_size=1)
+        if agent_id in style.named_ids:
+            detection = f"{channels.DETECTIONS.topic}{_filter('agent_id', agent_id)}.num_merged"
+            yield _series(style, agent_id, detection, "detected", line_size=3) | {"showLine": False}
 
 
 def _association_series(style: Style) -> Iterable[Json]:
     """How likely each agent is to be there, how open the origin of its detections is, and of each detection its share in it."""
-    for agent_id in style.agent_ids[:_MAX_SERIES_AGENTS]:
-        agent = f"{channels.AGENTS.topic}.agents[:]{_filter('id', agent_id)}"
-        yield _series(f"{agent}.probability", f"{agent_id} is there", style.hue(agent_id), line_size=2)
-        yield _series(f"{agent}.association_entropy_bits", f"{agent_id} entropy (bit)", style.hue(agent_id), line_size=1)
-        source = f"{channels.DETECTIONS.topic}.association.agents[:]{_filter('id', agent_id)}"
-        yield _series(f"{source}.probability", f"{agent_id} detected", style.hue(agent_id), line_size=3) | {"showLine": False}
+    for agent_id, agent in _plotted(style):
+        if agent_id in style.uncertain_ids:
+            yield _series(style, agent_id, f"{agent}.probability", "is there", line_size=2)
+            yield _series(style, agent_id, f"{agent}.association_entropy_bits", "entropy (bit)", line_size=1)
+            source = f"{channels.DETECTIONS.topic}.association.agents[:]{_filter('id', agent_id)}"
+            yield _series(style, agent_id, f"{source}.probability", "detected", line_size=3) | {"showLine": False}
 
 
-def _series(path: str, label: str, color: str, line_size: int) -> Json:
+def _plotted(style: Style) -> Iterable[tuple[str, str]]:
+    """Agents that there is something to plot of, and the message path of each; series of others would stay empty."""
+    for agent_id in style.plotted_ids:
+        yield agent_id, f"{channels.AGENTS.topic}.agents[:]{_filter('id', agent_id)}"
+
+
+def _series(style: Style, agent_id: str, path: str, label: str, line_size: int) -> Json:
     return {
         "value": path,
-        "enabled": True,
+        "enabled": agent_id in style.plotted_ids[:MAX_PLOTTED],
         "timestampMethod": "receiveTime",
-        "label": label,
-        "color": color,
+        "label": f"{agent_id} {label}",
+        "color": style.hue(agent_id),
         "lineSize": line_size,
     }
 

@@ -1,6 +1,7 @@
 """Messages for the Map panel of georeferenced logs: fixes of means and detections, regions as GeoJSON."""
 
 import json
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,7 @@ from shapely.geometry.base import BaseGeometry
 from pipeline.arrays import Float64s, Indices
 from pipeline.export import numbers
 from pipeline.export.display import Style
-from pipeline.export.playback import LiveAgent, Scene
+from pipeline.export.playback import LiveAgent, Scene, Tick, shows_new_scene
 from pipeline.frames import to_geodetic
 from pipeline.logs.writer import foxglove_class
 from pipeline.presence import with_presence
@@ -22,12 +23,27 @@ _REGION_STEPS = 24
 _SHARES = (0.9, 0.5)
 
 
-def encode_mean_fix(live: LiveAgent, now_ns: int, frame: Frame, style: Style, time_ns: int) -> bytes:
-    """foxglove.LocationFix of the weighted mean now, with the covariance of the hypotheses."""
-    now_m = live.at(now_ns)
-    covariance = numbers.covariance_m2(now_m, live.weight)
-    color = style.color(live.agent.agent_id)
-    return _encode_fix(live.weight @ now_m, style.z_m, covariance, frame, color, time_ns, _APPROXIMATED)
+class MovingFixes:
+    """foxglove.LocationFix of the weighted mean of each agent, with the covariance of its hypotheses, in the order of time.
+
+    One that would lie where the last one did, as far as can be seen, is left out: half of the ships of a harbour do not move.
+    """
+
+    def __init__(self, frame: Frame, style: Style) -> None:
+        self._frame, self._style = frame, style
+        self._shown: dict[str, tuple[Scene, Float64s]] = {}
+
+    def at(self, scene: Scene, now_ns: int, time_ns: int) -> Iterator[tuple[str, bytes]]:
+        """The agents of a scene that are new in it or have moved by now, each with its message."""
+        for live in scene.live:
+            agent_id = live.agent.agent_id
+            mean_m = live.mean_at(now_ns)
+            last_scene, last_m = self._shown.get(agent_id, (None, mean_m))
+            if last_scene is not scene or np.linalg.norm(mean_m - last_m) > 0.5 * self._style.size_m(agent_id):
+                self._shown[agent_id] = scene, mean_m
+                covariance = numbers.covariance_m2(live.at(now_ns), live.weight)
+                color, z_m = self._style.color(agent_id), self._style.z_m
+                yield agent_id, _encode_fix(mean_m, z_m, covariance, self._frame, color, time_ns, _APPROXIMATED)
 
 
 def encode_detection_fix(row: dict[str, Any], frame: Frame, style: Style, time_ns: int) -> bytes:
@@ -61,25 +77,46 @@ def _encode_fix(
     return data
 
 
-def encode_map(scene: Scene, frame: Frame, style: Style) -> bytes:
-    """foxglove.GeoJSON: for every live agent its mean track, and around it the regions that hold 90 % and 50 % at each step."""
+def plan_map(ticks: Sequence[Tick], period_s: float | None) -> dict[int, int]:
+    """Which ticks put regions on the map, and since when: a period (a history) after the last ones, and with the last scene.
+
+    Viewers draw all GeoJSON of a file at once. So no message tells of the future, and none of what another has told.
+    """
+    starts: dict[int, int] = {}
+    told_ns = None
+    shown = [(i, tick.scene) for i, tick in enumerate(ticks) if tick.scene and tick.scene.live and shows_new_scene(ticks, i)]
+    for index, scene in shown:
+        period_ns = scene.origin_ns - scene.start_ns if period_s is None else round(period_s * 1e9)
+        if told_ns is None or scene.origin_ns - told_ns >= period_ns or index == shown[-1][0]:
+            starts[index] = scene.start_ns if told_ns is None else max(told_ns, scene.start_ns)
+            told_ns = scene.origin_ns
+    return starts
+
+
+def encode_map(scene: Scene, start_ns: int, frame: Frame, style: Style) -> bytes:
+    """foxglove.GeoJSON: for every live agent its mean track between a time and the origin, and the regions around it.
+
+    They hold 90 % and 50 % at each step. What lies after the origin is left to what moves: viewers draw all of a file's
+    GeoJSON at once, whatever the time.
+    """
     features = []
     for live in scene.live:
         hue = style.hue(live.agent.agent_id)
         name = with_presence(live.agent.agent_id, live.agent.probability)
+        steps = _steps(live, start_ns)
         for share in _SHARES:
             style_90 = {"color": hue, "weight": 1, "opacity": 0.6, "fillColor": hue, "fillOpacity": 0.25 - 0.15 * share}
-            features.append(_feature(_region(live, share), frame, f"{name} {share:.0%}", style_90))
-        mean = {"color": hue, "weight": 3, "opacity": 1.0}
-        features.append(_feature(shapely.LineString(live.mean_m[_steps(live)]), frame, f"{name} mean", mean))
+            features.append(_feature(_region(live, steps, share), frame, f"{name} {share:.0%}", style_90))
+        if len(steps) > 1:
+            mean = {"color": hue, "weight": 3, "opacity": 1.0}
+            features.append(_feature(shapely.LineString(live.mean_m[steps]), frame, f"{name} mean", mean))
     text = json.dumps({"type": "FeatureCollection", "features": features}, separators=(",", ":"), ensure_ascii=False)
     data: bytes = foxglove_class("foxglove.GeoJSON")(geojson=text).SerializeToString()
     return data
 
 
-def _region(live: LiveAgent, share: float) -> BaseGeometry:
+def _region(live: LiveAgent, steps: Indices, share: float) -> BaseGeometry:
     """The union of discs about the mean, each holding `share` of the weight at its step, joined from step to step."""
-    steps = _steps(live)
     away = np.linalg.norm(live.position_m[:, steps] - live.mean_m[steps], axis=-1)
     radius = np.maximum(numbers.weighted_quantile(away, live.weight, share), 1e-3 * max(1.0, float(away.max())))
     discs = shapely.buffer(shapely.points(live.mean_m[steps]), radius, quad_segs=4)
@@ -89,9 +126,12 @@ def _region(live: LiveAgent, share: float) -> BaseGeometry:
     return shapely.simplify(shapely.union_all(shapely.convex_hull(pairs)), float(np.median(radius)) * 0.05)
 
 
-def _steps(live: LiveAgent) -> Indices:
-    num_steps = live.position_m.shape[1]
-    return np.unique(np.round(np.linspace(0, num_steps - 1, min(num_steps, _REGION_STEPS)))).astype(np.intp)
+def _steps(live: LiveAgent, start_ns: int) -> Indices:
+    """Steps from a time to the origin, both included, thinned."""
+    window = live.window
+    first = int(np.clip(window.origin_index + (start_ns - window.origin_ns) // window.step_ns, 0, window.origin_index))
+    num_steps = window.origin_index - first + 1
+    return np.unique(np.round(np.linspace(first, window.origin_index, min(num_steps, _REGION_STEPS)))).astype(np.intp)
 
 
 def _feature(shape_m: BaseGeometry, frame: Frame, name: str, style: dict[str, Any]) -> dict[str, Any]:

@@ -73,16 +73,21 @@ def _add_state(state: Any, live: LiveAgent, now_ns: int) -> None:
     state.id, state.status, state.window = agent.agent_id, agent.status, window.window
     state.num_detections = agent.num_detections
     if agent.age_s is not None:
-        state.age_s = agent.age_s + (now_ns - window.origin_ns) * 1e-9
-    state.x_m, state.y_m = (live.weight @ now_m).tolist()
-    state.spread_m = numbers.spread_m(now_m, live.weight)
-    state.horizon_spread_m = numbers.spread_m(live.position_m[:, -1], live.weight)
-    state.speed_mps = live.speed_mps(now_ns)
-    state.entropy = numbers.weight_entropy(live.weight)
+        state.age_s = _to_plot(agent.age_s + (now_ns - window.origin_ns) * 1e-9)
+    state.x_m, state.y_m = map(_to_plot, live.mean_at(now_ns).tolist())
+    state.spread_m = _to_plot(numbers.spread_m(now_m, live.weight))
+    state.horizon_spread_m = _to_plot(numbers.spread_m(live.position_m[:, -1], live.weight))
+    state.speed_mps = _to_plot(live.speed_mps(now_ns))
+    state.entropy = _to_plot(numbers.weight_entropy(live.weight))
     state.num_modes = live.num_modes
     for name in ("probability", "association_entropy_bits"):
         if getattr(agent, name) is not None:
             setattr(state, name, getattr(agent, name))
+
+
+def _to_plot(value: float) -> float:
+    """Rounded to a thousandth, as a power of two: the zero bits at the end compress well."""
+    return round(value * 1024.0) / 1024.0
 
 
 def encode_detection(row: dict[str, Any], frame: Frame, time_ns: int, sources: Sequence[dict[str, Any]] = ()) -> bytes:

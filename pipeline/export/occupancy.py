@@ -7,6 +7,8 @@ import numpy as np
 from pipeline.arrays import Float64s
 from pipeline.export.playback import LiveAgent
 
+_CELLS_OF_A_FUTURE = 96
+
 
 @dataclass(frozen=True, eq=False)
 class Occupancy:
@@ -19,14 +21,19 @@ class Occupancy:
 
 
 def future_occupancy(live: tuple[LiveAgent, ...], max_cells: int) -> Occupancy | None:
-    """How likely each place is to be visited between the origin and the end of the future; None without a live agent."""
+    """How likely each place is to be visited between the origin and the end of the future; None without a live agent.
+
+    Cells are fine enough to show the future of an agent of middling reach, at most `max_cells` along the longer side.
+    """
     futures = [agent.position_m[:, agent.window.origin_index :] for agent in live]
     if not futures:
         return None
     corners = np.concatenate([future.reshape(-1, 2) for future in futures])
     low, high = corners.min(axis=0), corners.max(axis=0)
+    reach_m = float(np.median([np.ptp(future, axis=(0, 1)).max() for future in futures]))
+    wanted_m = max(float(np.max(high - low)) / max(max_cells - 2, 1), reach_m / _CELLS_OF_A_FUTURE, 1e-5)
     # Powers of two: the same cells from window to window. Snapping to them may cost two cells.
-    cell_m = 2.0 ** np.ceil(np.log2(max(float(np.max(high - low)), 1e-3) / max(max_cells - 2, 1)))
+    cell_m = 2.0 ** np.ceil(np.log2(wanted_m))
     first = np.floor(low / cell_m).astype(np.int64)
     width, height = (np.floor(high / cell_m).astype(np.int64) - first + 1).tolist()
     rows = max(len(agent.window.weight) for agent in live)

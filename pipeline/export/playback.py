@@ -12,6 +12,9 @@ from pipeline.arrays import Float64s, Indices
 from pipeline.export import numbers
 from pipeline.results import AgentHypotheses, MissionHypotheses, WindowHypotheses
 
+_MOST_COMPARED = 64
+"""Hypotheses among which the central one is sought, the heaviest first: the work grows as their square."""
+
 
 @dataclass(frozen=True, eq=False)
 class LiveAgent:
@@ -32,6 +35,14 @@ class LiveAgent:
         return np.asarray(np.einsum("k,ktd->td", self.weight, self.position_m))
 
     @cached_property
+    def central(self) -> int:
+        """The hypothesis nearest to all others, over all steps: unlike the mean it is a track that somebody can have taken."""
+        few = np.argsort(-self.weight, kind="stable")[:_MOST_COMPARED]
+        track_m = self.position_m[few]
+        away_m = np.array([np.linalg.norm(track_m - one, axis=-1).mean(axis=-1) @ self.weight[few] for one in track_m])
+        return int(few[away_m.argmin()])
+
+    @cached_property
     def num_modes(self) -> int:
         """Separate groups of hypotheses at the end of the future."""
         return numbers.count_modes(self.position_m[:, -1], self.weight)
@@ -45,6 +56,10 @@ class LiveAgent:
         low = int(np.clip(step, 0, window.num_steps - 2))
         moved = np.linalg.norm(self.position_m[:, low + 1] - self.position_m[:, low], axis=-1)
         return float(self.weight @ moved) / (window.step_ns * 1e-9)
+
+    def mean_at(self, time_ns: int) -> Float64s:
+        """Weighted mean position [2] at a time."""
+        return np.asarray(self.weight @ self.at(time_ns))
 
     def at(self, time_ns: int) -> Float64s:
         """Positions [K, 2] at a time: linear between steps, the first or last step outside of them."""
@@ -102,6 +117,11 @@ def plan_ticks(scenes: Sequence[Scene], tick_ns: int, end_ns: int) -> list[Tick]
         is_near = following is not None and (not is_live or following < time_ns + 2 * tick_ns)
         time_ns = following if following is not None and is_near else time_ns + tick_ns
     return ticks
+
+
+def shows_new_scene(ticks: Sequence[Tick], index: int) -> bool:
+    """Whether a tick shows another scene than the one before it."""
+    return index == 0 or ticks[index].scene is not ticks[index - 1].scene
 
 
 def _scene(group: list[WindowHypotheses], stride_ns: int) -> Scene:

@@ -89,12 +89,12 @@ def encode_time(time_ns: int) -> bytes:
     return (b"\x08" + varint(seconds) if seconds else b"") + (b"\x10" + varint(nanos) if nanos else b"")
 
 
-def round_positions(position_m: Floats, extent_m: float) -> Float64s:
-    """Positions on a grid of 1/16 m for a scene a kilometre wide, finer and coarser in proportion (powers of two).
+def round_positions(position_m: Floats, reach_m: float) -> Float64s:
+    """Positions on a grid of half a metre for a drawing a kilometre wide, finer and coarser in proportion (powers of two).
 
     The eye cannot tell, and the zero bits at the end of every number compress well.
     """
-    quantum = 2.0 ** np.round(np.log2(max(extent_m, 1e-6) / 16384.0))
+    quantum = 2.0 ** np.round(np.log2(max(reach_m, 1e-6) / 2048.0))
     # Adding zero turns -0.0 into 0.0.
     rounded: Float64s = np.round(np.asarray(position_m, np.float64) / quantum) * quantum + 0.0
     return rounded
@@ -114,7 +114,7 @@ def _encode_lines(lines: Lines) -> bytes:
     return bytes(wire)
 
 
-@functools.lru_cache(maxsize=64)
+@functools.lru_cache(maxsize=1024)
 def _line_template(num_points: int, axes: int, kind: LineType, thickness_px: float) -> tuple[bytes, int, int]:
     """One line on the wire with zeros for its numbers, and where the first coordinate and the first channel of colour stand."""
     before = (b"\x08" + bytes([kind]) if kind else b"") + field(2, _IDENTITY_POSE)

@@ -1,4 +1,5 @@
 import hashlib
+import itertools
 import json
 import os
 import shutil
@@ -34,8 +35,11 @@ from mcap_protobuf.decoder import DecoderFactory
 
 from cadence.errors import InputError
 from pipeline.export import numbers
-from pipeline.export.playback import Scene, plan_ticks
-from pipeline.export.stage import ExportConfig, export, num_vertices
+from pipeline.export.config import ExportConfig
+from pipeline.export.maps import plan_map
+from pipeline.export.mission import num_vertices
+from pipeline.export.playback import LiveAgent, Scene, Tick, build_scenes, plan_ticks
+from pipeline.export.stage import export
 from pipeline.frames import to_local
 from pipeline.progress import Progress
 from pipeline.results import read_hypothesis_tables
@@ -121,41 +125,92 @@ def test_rows_in_any_order_give_the_same(mission, tmp_path):
             assert np.array_equal(agent.position_m, expected.position_m)
 
 
-def test_scene_is_self_contained_and_loses_agents_without_a_window(mission):
-    found = dict(messages(mission, "/cadence/scene", SceneUpdate))
-    first, last = START_NS + FIRST_ORIGIN_NS, START_NS + FIRST_ORIGIN_NS + (NUM_WINDOWS - 1) * STRIDE_NS
-    assert {e.id for e in found[first].entities} >= {"agent/T0", "agent/T1"}
-    assert {e.id for e in found[last].entities if e.id.startswith("agent/")} == {"agent/T0"}
-    assert all(len(update.deletions) == 1 for update in found.values())
-    assert not found[max(found)].entities, "after the end of the last window nothing is shown"
-    agent = found[first].entities[0]
-    assert len(agent.lines) == 2 * (NUM_HYPOTHESES + 1)
-    past = [line for line in agent.lines if line.type == LinePrimitive.LINE_STRIP]
-    future = [line for line in agent.lines if line.type == LinePrimitive.LINE_LIST]
+FIRST, LAST = START_NS + FIRST_ORIGIN_NS, START_NS + FIRST_ORIGIN_NS + (NUM_WINDOWS - 1) * STRIDE_NS
+
+
+def lines_of(directory, num=0):
+    """Past and future lines of the first agent in a scene."""
+    lines = messages(directory, "/cadence/scene", SceneUpdate)[num][1].entities[0].lines
+    thick = {line.thickness for line in lines}
+    assert len(thick) == 4, "past and future, hypotheses and the central one: each has its thickness"
+    past = [line for line in lines if line.thickness in (1.5, 4.0)]
+    return past, [line for line in lines if line not in past]
+
+
+def test_lines_are_written_once_a_window_and_what_moves_each_tick(mission):
+    scenes, present = (dict(messages(mission, f"/cadence/{topic}", SceneUpdate)) for topic in ("scene", "present"))
+    assert len(scenes) == NUM_WINDOWS + 1
+    assert len(present) > 10 * len(scenes)
+    for shown in (scenes, present):
+        assert all(len(update.deletions) == 1 for update in shown.values()), "one may go to any moment"
+        assert {e.id for e in shown[FIRST].entities} >= {"agent/T0", "agent/T1"}
+        assert {e.id for e in shown[LAST].entities if e.id.startswith("agent/")} == {"agent/T0"}
+        assert not shown[max(shown)].entities, "after the end of the last window nothing is shown"
+    assert all(not entity.lines for update in present.values() for entity in update.entities)
+
+
+def test_past_and_future_are_whole_lines_that_differ(mission):
+    past, future = lines_of(mission)
     assert len(past) == len(future) == NUM_HYPOTHESES + 1
-    assert all(len(line.points) % 2 == 0 for line in future)
-    assert len(past[0].points) + len(future[0].points) <= 32
-    assert past[-1].thickness > past[0].thickness, "the mean is drawn thicker"
+    assert {line.type for line in (*past, *future)} == {LinePrimitive.LINE_STRIP}
+    assert max(line.thickness for line in past) > max(line.thickness for line in future)
     assert past[0].color.r < future[0].color.r, "the future is lighter"
+    assert past[0].color.a > future[0].color.a, "and fainter"
+    ends = {(line.points[-1].x, line.points[-1].y) for line in past}
+    assert {(line.points[0].x, line.points[0].y) for line in future} == ends, "each future begins where its past ends"
+
+
+def test_detections_are_seen_from_their_time_on(mission):
+    used, since = (messages(mission, f"/cadence/{topic}", SceneUpdate) for topic in ("scene", "present"))
+    table, _ = read_table(mission / "detections.parquet", "detections")
+    time_ns = np.sort(table["time_ns"].to_numpy()[np.array(table["agent_id"]) == "T0"])
+
+    def num_seen(update):
+        return sum(len(entity.spheres) for entity in update.entities if entity.id == "detections/T0")
+
+    for now_ns, update in since[:: len(since) // 9]:
+        origin_ns, scene = max((item for item in used if item[0] <= now_ns), key=lambda item: item[0])
+        if scene.entities:
+            assert num_seen(update) == np.count_nonzero((time_ns > origin_ns) & (time_ns <= now_ns))
+            start_ns = origin_ns - 63 * 1_000_000_000
+            assert num_seen(scene) == np.count_nonzero((time_ns >= start_ns) & (time_ns <= origin_ns))
 
 
 def test_line_opacity_follows_the_weights(mission):
     window = read_hypothesis_tables(mission).windows[0]
-    lines = messages(mission, "/cadence/scene", SceneUpdate)[0][1].entities[0].lines[:NUM_HYPOTHESES]
-    alpha = np.array([line.color.a for line in lines])
-    assert np.array_equal(np.argsort(alpha, kind="stable")[-1:], np.argsort(window.weight)[-1:])
-    assert alpha.min() > 0.05
-    assert np.corrcoef(alpha, window.weight)[0, 1] > 0.99
+    past, _ = lines_of(mission)
+    track_m = window.agents[0].position_m[:, window.origin_index] + np.array(window.agents[0].datum_m)
+    alpha = {}
+    for line in past[:-1]:
+        end_m = np.array([line.points[-1].x, line.points[-1].y])
+        alpha[int(np.linalg.norm(track_m - end_m, axis=-1).argmin())] = line.color.a
+    assert len(alpha) == NUM_HYPOTHESES
+    assert min(alpha.values()) > 0.05
+    assert np.corrcoef([alpha[k] for k in range(NUM_HYPOTHESES)], window.weight)[0, 1] > 0.99
 
 
-def test_lines_pass_through_the_hypotheses(mission):
+def test_lines_follow_the_hypotheses_with_few_points(mission):
     window = read_hypothesis_tables(mission).windows[0]
     agent = window.agents[0]
-    line = messages(mission, "/cadence/scene", SceneUpdate)[0][1].entities[0].lines[3]
-    drawn = np.array([[point.x, point.y] for point in line.points])
-    track = agent.position_m[3].astype(np.float64) + agent.datum_m
-    assert np.allclose(drawn[[0, -1]], track[[0, window.origin_index]], atol=1 / 16)
-    assert np.max(np.min(np.linalg.norm(drawn[:, None] - track[None], axis=-1), axis=1)) < 1 / 16
+    tracks = agent.position_m.astype(np.float64) + agent.datum_m
+    reach_m = np.ptp(tracks, axis=(0, 1)).max()
+    for line in lines_of(mission)[0]:
+        drawn = np.array([[point.x, point.y] for point in line.points])
+        track = min(tracks, key=lambda track: np.linalg.norm(track[[0, window.origin_index]] - drawn[[0, -1]], axis=-1).sum())
+        dense = np.concatenate([a + np.linspace(0, 1, 200)[:, None] * (b - a) for a, b in itertools.pairwise(drawn)])
+        away = np.linalg.norm(track[: window.origin_index + 1, None] - dense, axis=-1).min(axis=1)
+        assert away.max() <= reach_m / 300
+        assert len(drawn) < window.origin_index
+
+
+def test_the_thick_line_is_one_of_the_hypotheses():
+    rng = np.random.default_rng(2)
+    side = np.where(np.arange(21) % 3, 1.0, -1.0)[:, None]
+    x_m = np.broadcast_to(np.linspace(0.0, 100.0, 9), (21, 9))
+    y_m = side * 30.0 * np.sin(np.linspace(0.0, np.pi, 9)) + rng.normal(0, 1.0, (21, 1))
+    live = LiveAgent(None, None, np.arange(21), np.full(21, 1 / 21), np.stack([x_m, y_m], axis=-1))
+    assert side[live.central, 0] == 1.0, "of the larger group, not between the two"
+    assert abs(live.mean_m[4, 1]) < 15.0
 
 
 def test_only_the_heaviest_hypotheses_are_drawn(tmp_path):
@@ -163,7 +218,7 @@ def test_only_the_heaviest_hypotheses_are_drawn(tmp_path):
     export(directory, ExportConfig(num_scene_hypotheses=3), QUIET)
     entity = messages(directory, "/cadence/scene", SceneUpdate)[0][1].entities[0]
     assert len(entity.lines) == 2 * (3 + 1)
-    assert max(line.color.a for line in entity.lines[:3]) == pytest.approx(0.65, abs=0.02)
+    assert max(line.color.a for line in entity.lines if line.thickness < 2.0) == pytest.approx(0.65, abs=0.02)
 
 
 def test_agents_at_an_origin_are_the_numbers_of_infer(mission):
@@ -175,13 +230,13 @@ def test_agents_at_an_origin_are_the_numbers_of_infer(mission):
         for agent in window.agents:
             if agent.is_live:
                 state = states[agent.agent_id]
-                assert state.age_s == pytest.approx(agent.age_s)
+                assert state.age_s == pytest.approx(agent.age_s, abs=1e-3)
                 assert state.num_detections == agent.num_detections
                 now = agent.position_m[:, window.origin_index].astype(np.float64)
                 mean = np.average(now, axis=0, weights=window.weight)
                 spread = np.sqrt(np.average(np.sum((now - mean) ** 2, axis=-1), weights=window.weight))
-                assert state.spread_m == pytest.approx(spread, rel=1e-5)
-                assert [state.x_m, state.y_m] == pytest.approx(mean + agent.datum_m, rel=1e-5)
+                assert state.spread_m == pytest.approx(spread, abs=1e-3)
+                assert [state.x_m, state.y_m] == pytest.approx(mean + agent.datum_m, abs=1e-3)
                 assert 0.0 < state.entropy <= 1.0
                 assert state.num_modes >= 1
                 assert state.speed_mps == pytest.approx(3.0, rel=0.6)
@@ -229,14 +284,14 @@ def test_georeferenced_fixes_and_regions(mission, georeferenced):
     assert not messages(mission, "/cadence/map")
     states = dict(messages(georeferenced, "/cadence/agents", message_class("cadence.Agents")))
     fixes = messages(georeferenced, "/cadence/fix/T0", LocationFix)
-    assert len(fixes) > 50
+    assert NUM_WINDOWS <= len(fixes) < len(states), "where the mean moves, and with each new window"
     for time_ns, fix in fixes[::20]:
         state = next(state for state in states[time_ns].agents if state.id == "T0")
         x_m, y_m = to_local(GEOREFERENCED, np.array([fix.latitude]), np.array([fix.longitude]))
         assert [x_m[0], y_m[0]] == pytest.approx([state.x_m, state.y_m], abs=0.01)
-        assert fix.position_covariance[0] + fix.position_covariance[4] == pytest.approx(state.spread_m**2, rel=1e-6)
+        assert fix.position_covariance[0] + fix.position_covariance[4] == pytest.approx(state.spread_m**2, rel=1e-3)
     regions = messages(georeferenced, "/cadence/map", GeoJSON)
-    assert 1 <= len(regions) <= 3
+    assert 1 <= len(regions) <= 4
     features = json.loads(regions[0][1].geojson)["features"]
     assert [f["properties"]["name"] for f in features] == [
         f"{a} {kind}" for a in ("T0", "T1") for kind in ("90%", "50%", "mean")
@@ -330,10 +385,12 @@ def test_recording_in_parts_is_not_combined(tmp_path):
     assert not list(directory.glob("*.mcap"))
 
 
-def test_scenes_that_change_each_time_have_fewer_points():
-    assert num_vertices(100, 120, ExportConfig()) == 15
-    assert num_vertices(100, 1000, ExportConfig()) == 32
-    assert num_vertices(100, 120, ExportConfig(max_vertices=40)) == 40
+def test_lines_have_fewer_points_where_there_are_many(mission):
+    scenes = build_scenes(read_hypothesis_tables(mission))
+    assert num_vertices(scenes, ExportConfig()) == 48
+    assert num_vertices(scenes * 100, ExportConfig(max_scene_mb=6.0)) == 15
+    assert num_vertices(scenes * 100, ExportConfig(max_scene_mb=0.1)) == 4
+    assert num_vertices(scenes, ExportConfig(max_vertices=40)) == 40
 
 
 @pytest.mark.parametrize(
@@ -420,10 +477,17 @@ def test_ticks():
 
 def test_scene_size_stays_under_the_cap(tmp_path):
     directory = build_mission(tmp_path)
-    small = export(directory, ExportConfig(max_scene_mb=0.3), QUIET).summary
+    small = export(directory, ExportConfig(max_scene_mb=0.05), QUIET).summary
     assert small["tick_s"] > 1.0
-    raw = sum(len(data) for _, data in messages(directory, "/cadence/scene"))
-    assert raw < 0.6e6
+    for topic in ("scene", "present"):
+        assert sum(len(data) for _, data in messages(directory, f"/cadence/{topic}")) < 0.1e6
+
+
+def test_regions_of_the_map_lie_one_behind_the_other_and_never_ahead():
+    scenes = [Scene(origin, origin - 10, origin + 5, (), (None,)) for origin in (0, 4, 8, 12, 40, 43)]
+    ticks = [Tick(scene.origin_ns, scene) for scene in scenes]
+    assert plan_map(ticks, None) == {0: -10, 3: 2, 4: 30, 5: 40}
+    assert plan_map(ticks, 4e-9) == {0: -10, 1: 0, 2: 4, 3: 8, 4: 30, 5: 40}
 
 
 def test_modes_are_counted():
@@ -485,7 +549,7 @@ def test_how_likely_an_agent_is_there_stands_beside_its_name(tmp_path):
     directory = build_mission(tmp_path, frame=GEOREFERENCED)
     make_uncertain(directory, {"T0": 0.996, "T1": 0.62})
     export(directory, CONFIG, QUIET)
-    scenes = [scene for _, scene in messages(directory, "/cadence/scene", SceneUpdate)]
+    scenes = [scene for _, scene in messages(directory, "/cadence/present", SceneUpdate)]
     texts = {label.text for scene in scenes for entity in scene.entities for label in entity.texts}
     assert texts == {"T0 (there: > 99 %)", "T1 (there: 62 %)"}
     maps = [json.loads(message.geojson) for _, message in messages(directory, "/cadence/map", GeoJSON)]

@@ -1,4 +1,5 @@
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,7 +10,8 @@ from pipeline.export.layouts import build_layout, build_legacy_layout
 from pipeline.tables import Frame
 from schemas import channels
 
-STYLE = Style(("T0", 'say "hi"'), (100.0, -50.0), 1000.0, 0.0, 30, 32)
+IDS = ("T0", 'say "hi"')
+STYLE = Style(IDS, (100.0, -50.0), 1000.0, 0.0, 30, 32, {}, plotted_ids=IDS, named_ids=frozenset(IDS))
 MAP, EARTH = Frame("map"), Frame("mission", 50.8, -1.2)
 TOPICS = [
     c.topic for c in (channels.SCENE, channels.AGENTS, channels.OCCUPANCY, channels.DETECTIONS, channels.fix_channel("T0"))
@@ -70,6 +72,37 @@ def test_plot_paths():
     assert '/cadence/agents.agents[:]{id=="T0"}.spread_m' in values
     assert "/cadence/agents.agents[:]{id=='say \"hi\"'}.spread_m" in values
     assert '/cadence/detections{agent_id=="T0"}.num_merged' in values
+
+
+def series_of(style):
+    plots = [panel for panel in panels(build_layout(MAP, style, SOURCE, TOPICS)["content"]) if panel["panelType"] == "Plot"]
+    return [plot["title"] for plot in plots], [series for plot in plots for series in plot["config"]["paths"]]
+
+
+def test_of_many_agents_all_have_series_and_the_title_says_which_are_on():
+    ids = tuple(f"T{number}" for number in range(33))
+    titles, series = series_of(replace(STYLE, agent_ids=ids, plotted_ids=ids[::-1], named_ids=frozenset(ids)))
+    assert titles == ["Spread (m), 12 of 33 agents", "Detections, 12 of 33 agents"]
+    assert {each["label"].partition(" ")[0] for each in series} == set(ids)
+    assert {each["label"].partition(" ")[0] for each in series if each["enabled"]} == set(ids[21:])
+
+
+def test_no_series_stays_empty():
+    """Agents without hypotheses have none; those told apart by us have no detections under their names."""
+    style = replace(STYLE, plotted_ids=("a0",), named_ids=frozenset({"T0"}), uncertain_ids=frozenset({"a0"}))
+    titles, series = series_of(style)
+    assert titles == ["Spread (m)", "Detections", "Association"]
+    assert [each["label"] for each in series] == [
+        *("a0 now", "a0 horizon", "a0 age (s)", "a0 is there", "a0 entropy (bit)", "a0 detected")
+    ]
+    assert not [each["value"] for each in series if "{agent_id==" in each["value"]]
+
+
+def test_older_form_holds_what_importers_demand():
+    """Lichtblick 1.27 refuses a layout without these fields, or with other types of them."""
+    layout = build_legacy_layout(EARTH, STYLE, SOURCE, TOPICS)
+    assert all(isinstance(layout[name], dict) for name in ("configById", "globalVariables", "userNodes", "layout"))
+    assert isinstance(layout["playbackConfig"]["speed"], int)
 
 
 def test_form_is_that_of_the_foxglove_sdk():

@@ -66,13 +66,13 @@ def test_time(time_ns):
 
 
 @pytest.mark.parametrize(
-    ("extent_m", "quantum_m"), [(1024.0, 1 / 16), (1000.0, 1 / 16), (700.0, 1 / 32), (8.0, 2**-11), (2.0e6, 128.0)]
+    ("reach_m", "quantum_m"), [(1024.0, 1 / 2), (1000.0, 1 / 2), (700.0, 1 / 4), (8.0, 2**-8), (2.0e6, 1024.0)]
 )
-def test_rounding_follows_the_extent(extent_m, quantum_m):
-    rounded = round_positions(np.linspace(-extent_m, extent_m, 1001), extent_m)
+def test_rounding_follows_what_is_drawn(reach_m, quantum_m):
+    rounded = round_positions(np.linspace(-reach_m, reach_m, 1001), reach_m)
     assert np.all(rounded / quantum_m == np.round(rounded / quantum_m))
-    assert np.max(np.abs(rounded - np.linspace(-extent_m, extent_m, 1001))) <= quantum_m / 2
-    assert not np.signbit(round_positions(np.array([-1e-9]), extent_m))[0]
+    assert np.max(np.abs(rounded - np.linspace(-reach_m, reach_m, 1001))) <= quantum_m / 2
+    assert not np.signbit(round_positions(np.array([-1e-9]), reach_m))[0]
 
 
 def test_encoding_is_much_faster_than_point_by_point():

@@ -29,7 +29,8 @@ from cadence.errors import InputError
 from cadence.types import Detections, HypothesisSet, WindowBatch
 from pipeline import associations
 from pipeline.associations import AssociatedWindows, DataAssociation, build_associated_windows, shared_out, tell_sources
-from pipeline.export.stage import ExportConfig, export
+from pipeline.export.config import ExportConfig
+from pipeline.export.stage import export
 from pipeline.infer.config import InferConfig
 from pipeline.infer.draws import draw_associations
 from pipeline.infer.stage import infer
