@@ -6,21 +6,17 @@ Shapes everywhere: hypotheses position_m [B, K, A, T, 2], weight [B, K] (rows su
 
 from cadence.metrics.bootstrap import Interval, bootstrap_mean, bootstrap_ratio
 from cadence.metrics.calibration import coverage, density_rank
-from cadence.metrics.motion import StepLengths, collision_share, step_length_statistics
 from cadence.metrics.position import ade, expected_distance, masked_mean, mean_error, min_ade, min_ade_distance, spread
-from cadence.metrics.scores import crps, energy_score, trajectory_energy_score
+from cadence.metrics.scores import energy_score, trajectory_energy_score
 from cadence.metrics.sets import Gospa, gospa, ospa
 
 __all__ = [
     "Gospa",
     "Interval",
-    "StepLengths",
     "ade",
     "bootstrap_mean",
     "bootstrap_ratio",
-    "collision_share",
     "coverage",
-    "crps",
     "density_rank",
     "energy_score",
     "expected_distance",
@@ -31,6 +27,5 @@ __all__ = [
     "min_ade_distance",
     "ospa",
     "spread",
-    "step_length_statistics",
     "trajectory_energy_score",
 ]

@@ -1,4 +1,4 @@
-"""Proper scores of weighted samples: energy score and CRPS (Gneiting and Raftery 2007), lower is better.
+"""Proper scores of weighted samples: the energy score (Gneiting and Raftery 2007), lower is better.
 
 Two forms of the spread term E|X - X'| / 2:
 
@@ -20,7 +20,7 @@ _MAX_PAIRS = 8_000_000
 
 
 def energy_score(position_m: Tensor, weight: Tensor, truth_m: Tensor, is_fair: bool = False) -> Tensor:
-    """Energy score of the two-dimensional position at every step, metres [B, A, T]."""
+    """Energy score of the position at every step, metres [B, A, T]; of one coordinate alone it is the CRPS."""
     b, k, a, t, s = position_m.shape
     samples = position_m.double().permute(0, 2, 3, 1, 4).reshape(b * a * t, k, s)
     weights = weight.double()[:, None, None].expand(b, a, t, k).reshape(b * a * t, k)
@@ -40,11 +40,6 @@ def trajectory_energy_score(
     samples = torch.where(is_known[:, None, ..., None], position_m.double(), 0.0).reshape(b, k, -1)
     truth = torch.where(is_known[..., None], truth_m.double(), 0.0).reshape(b, -1)
     return _energy(samples, weight.double(), truth, is_fair) * scale
-
-
-def crps(values: Tensor, weight: Tensor, truth: Tensor, is_fair: bool = False) -> Tensor:
-    """Continuous ranked probability score of one coordinate: values [B, K, A, T], truth [B, A, T] -> [B, A, T]."""
-    return energy_score(values[..., None], weight, truth[..., None], is_fair)
 
 
 def _energy(samples: Tensor, weight: Tensor, truth: Tensor, is_fair: bool) -> Tensor:

@@ -45,9 +45,9 @@ def test_energy_score_golden(golden: dict) -> None:
     assert score.flatten().tolist() == pytest.approx(golden["energy_score_nrg"], abs=1e-12)
 
 
-def test_crps_golden(golden: dict) -> None:
+def test_energy_score_of_one_coordinate_is_the_crps(golden: dict) -> None:
     position, weight, truth = golden_samples()
-    score = metrics.crps(position[..., 0], weight, truth[..., 0])
+    score = metrics.energy_score(position[..., :1], weight, truth[..., :1])
     assert score.flatten().tolist() == pytest.approx(golden["crps_x_properscoring"], abs=1e-12)
 
 
@@ -183,24 +183,6 @@ def test_coverage_of_equal_samples() -> None:
     assert metrics.coverage(same, uniform(1, 30), torch.zeros(1, 1, 1, 2)).flatten().tolist() == pytest.approx([0.5, 0.9])
     rounded = torch.full((1, 1, 1, 2), 2e-4)  # what float32 makes of an exact detection far from the datum
     assert metrics.coverage(same, uniform(1, 30), rounded).flatten().tolist() == pytest.approx([0.5, 0.9])
-
-
-def test_step_lengths_by_hand() -> None:
-    position = torch.zeros(1, 2, 1, 4, 2)
-    position[0, 0, 0, :, 0] = torch.tensor([0.0, 1.0, 2.0, 100.0])
-    position[0, 1, 0, :, 1] = torch.tensor([0.0, 3.0, 0.0, 100.0])
-    known = torch.tensor([[[True, True, True, False]]])
-    found = metrics.step_length_statistics(position, torch.tensor([[0.75, 0.25]]), known)
-    assert found == metrics.StepLengths(mean_m=1.5, median_m=1.0, p95_m=3.0, roughness_m=1.5)
-    empty = metrics.step_length_statistics(position, uniform(1, 2), torch.zeros_like(known))
-    assert math.isnan(empty.mean_m) and math.isnan(empty.median_m)
-
-
-def test_collision_share_is_weighted() -> None:
-    inside = torch.zeros(1, 2, 1, 4, dtype=torch.bool)
-    inside[0, 0, 0, :2] = True
-    known = torch.ones(1, 1, 4, dtype=torch.bool)
-    assert metrics.collision_share(inside, torch.tensor([[0.9, 0.1]]), known).item() == pytest.approx(0.45)
 
 
 def test_bootstrap_mean_covers_and_is_deterministic() -> None:
