@@ -8,7 +8,7 @@ from itertools import groupby
 
 import numpy as np
 
-from pipeline.arrays import Bools, Float64s, Int64s
+from cadence.arrays import Bools, Float64s, Int64s
 from pipeline.report.mission import Fan, Mission, Points, WindowRow
 from pipeline.tracks import interpolated
 

@@ -7,7 +7,7 @@ from html import escape
 
 import numpy as np
 
-from pipeline.arrays import Float64s, Int64s
+from cadence.arrays import Float64s, Int64s
 from pipeline.report.analysis import Analysis
 from pipeline.report.clock import Clock
 from pipeline.report.lengths import metres

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.arrays import Float32s, Float64s, Indices
+from cadence.arrays import Float32s, Float64s, Indices
 from pipeline.report.analysis import FanShape
 from pipeline.report.mission import Fan, Mission
 

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
+from pipeline.logs.reader import Health
 from pipeline.report.clock import Clock, duration
 from pipeline.report.markup import flatten, label, pairs, section, table, text
 from pipeline.report.mission import Mission
@@ -38,13 +39,9 @@ LEFT_OUT = {
 
 def health_section(mission: Mission) -> str:
     """Completeness, problems, lost spans, counts of extract, and the channels."""
-    health = mission.catalogue.get("health")
-    health = health if isinstance(health, dict) else {}
+    health = mission.catalogue.health
     content = _verdict(health) + _problems(health) + _lost_spans(mission, health)
-    known = {"is_complete", "problems", "lost_spans_ns"}
-    rows = [(text(words), text(health[key])) for key, words in FACTS.items() if key in health]
-    rows += [(label(key), text(value)) for key, value in flatten(health) if key.split(".")[0] not in {*known, *FACTS}]
-    left = f"<div><h3>Log</h3>{pairs(rows)}</div>" if rows else ""
+    left = f"<div><h3>Log</h3>{pairs([(text(words), text(getattr(health, key))) for key, words in FACTS.items()])}</div>"
     summary = mission.manifests.get("extract", {}).get("summary") or {}
     rows = _extraction(summary)
     right = f"<div><h3>Extraction</h3>{pairs(rows)}</div>" if rows else ""
@@ -69,48 +66,43 @@ def _extraction(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
     return [(label(key), text(value)) for key, value in flatten(summary)[:MAX_ENTRIES] if key.split(".")[0] not in known] + rows
 
 
-def _verdict(health: Mapping[str, Any]) -> str:
-    match health.get("is_complete"):
-        case True:
-            return "<p>The log is complete: nothing that its recorder wrote is missing.</p>"
-        case False:
-            return '<p class="problem">The log is not complete: messages are lost, or may be. What could be read was used.</p>'
-        case _:
-            return "<p>The catalogue does not say whether the log is complete.</p>"
+def _verdict(health: Health) -> str:
+    if health.is_complete:
+        return "<p>The log is complete: nothing that its recorder wrote is missing.</p>"
+    return '<p class="problem">The log is not complete: messages are lost, or may be. What could be read was used.</p>'
 
 
-def _problems(health: Mapping[str, Any]) -> str:
-    problems = health.get("problems") or []
+def _problems(health: Health) -> str:
+    problems = health.problems
     items = "".join(f"<li>{text(problem)}</li>" for problem in problems[:MAX_ENTRIES])
     rest = f"<li>and {len(problems) - MAX_ENTRIES} more</li>" if len(problems) > MAX_ENTRIES else ""
     return f"<h3>Problems</h3><ul>{items}{rest}</ul>" if items else ""
 
 
-def _lost_spans(mission: Mission, health: Mapping[str, Any]) -> str:
+def _lost_spans(mission: Mission, health: Health) -> str:
     clock = Clock(mission.start_ns, mission.end_ns)
     rows = [
         [
-            text(clock.moment(int(first), 3)),
-            text(clock.moment(int(last), 3)),
-            text(duration(max(int(last) - int(first), 0) / 1e9)),
+            text(clock.moment(first, 3)),
+            text(clock.moment(last, 3)),
+            text(duration(max(last - first, 0) / 1e9)),
         ]
-        for first, last in (health.get("lost_spans_ns") or [])[:MAX_ENTRIES]
+        for first, last in health.lost_spans_ns[:MAX_ENTRIES]
     ]
     return f"<h3>Lost spans (log time)</h3>{table(['from', 'to', 'length'], rows)}" if rows else ""
 
 
 def _channels(mission: Mission) -> str:
-    channels = [entry for entry in mission.catalogue.get("channels") or [] if isinstance(entry, dict)]
+    channels = mission.catalogue.channels
     if not channels:
         return ""
-    wanted = ("topic", "schema_name", "encoding", "num_messages", "mean_rate_hz", "frame_id", "reason")
-    heads = [key for key in wanted if any(key in entry for entry in channels)]
-    rows = [[text(entry.get(key, "")) for key in heads] for entry in channels[:MAX_CHANNELS]]
+    heads = ("topic", "schema_name", "encoding", "num_messages", "mean_rate_hz", "frame_id", "reason")
+    rows = [[text(getattr(channel, key)) for key in heads] for channel in channels[:MAX_CHANNELS]]
     rest = (
         f'<p class="note">{len(channels) - MAX_CHANNELS} more channels are in catalogue.json.</p>'
         if len(channels) > MAX_CHANNELS
         else ""
     )
-    numeric = [heads.index(key) for key in ("num_messages", "mean_rate_hz") if key in heads]
+    numeric = [heads.index(key) for key in ("num_messages", "mean_rate_hz")]
     body = table([key.replace("_", " ") for key in heads], rows, numeric)
     return f"<details><summary>{len(channels)} channels</summary>{body}{rest}</details>"

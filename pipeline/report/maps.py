@@ -8,7 +8,7 @@ from html import escape
 
 import numpy as np
 
-from pipeline.arrays import Float64s
+from cadence.arrays import Float64s
 from pipeline.report.analysis import FanShape
 from pipeline.report.lengths import metres, nice_length
 from pipeline.report.mission import Fan, Mission, Obstacle

@@ -13,11 +13,13 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
+from cadence.arrays import Float32s, Float64s, Int64s
 from cadence.errors import InputError
-from pipeline.arrays import Float32s, Float64s, Int64s
+from pipeline.catalogue import Catalogue, read_catalogue, stated_path
 from pipeline.documents import parse_json
 from pipeline.files import hash_file
 from pipeline.manifest import read_manifest
+from pipeline.missions import CATALOGUE_NAME
 from pipeline.obstacle_file import OBSTACLES_NAME, read_obstacle_entries
 from pipeline.presence import with_presence
 from pipeline.report.origins import Origins, origins_of, with_likeliest
@@ -110,13 +112,14 @@ class Obstacle:
 class Mission:
     """Everything that the page tells of one mission.
 
+    log                       its path; relative to the mission directory where it lies in it
     start_ns, end_ns          of what is drawn: detections, truth, window origins
     log_start_ns, log_end_ns  of the log, where it keeps the same clock
     origins                   who was found among detections of unknown origin; these are given to their likeliest agent
     """
 
-    name: str
-    catalogue: JsonDict
+    log: str
+    catalogue: Catalogue
     frame: Frame
     agents: tuple[str, ...]
     sensors: tuple[str, ...]
@@ -141,6 +144,11 @@ class Mission:
         return with_presence(self.agents[agent], max(found, default=None))
 
     @property
+    def name(self) -> str:
+        """What the log's file is called."""
+        return self.catalogue.path.name
+
+    @property
     def num_tracked(self) -> int:
         """Agents that have hypotheses; the others are only in the truth, or of them nothing can be said."""
         return len({fan.agent for fan in self.fans})
@@ -159,7 +167,7 @@ class Mission:
 
 def mission_inputs(directory: Path) -> list[Path]:
     """The files of `directory` that the page depends on, as far as they exist."""
-    names = ["catalogue.json", "detections.parquet", "hypotheses.parquet", "windows.parquet", OBSTACLES_NAME]
+    names = [CATALOGUE_NAME, "detections.parquet", "hypotheses.parquet", "windows.parquet", OBSTACLES_NAME]
     names += [
         "associations.parquet",
         "truth.parquet",
@@ -172,7 +180,7 @@ def mission_inputs(directory: Path) -> list[Path]:
 
 def load_mission(directory: Path) -> Mission:
     """The mission in `directory`; `InputError` where a file that the page cannot do without is absent or damaged."""
-    catalogue = _read_json(directory / "catalogue.json")
+    catalogue = read_catalogue(directory)
     detections, frame = read_table(directory / "detections.parquet", "detections")
     hypotheses = read_hypothesis_tables(directory)
     associations = _optional_table(directory, "associations")
@@ -191,7 +199,7 @@ def load_mission(directory: Path) -> Mission:
     start_ns, end_ns = _time_range(catalogue, [points for points in (detection_points, truth_points) if points], rows)
     log_start_ns, log_end_ns = _log_range(catalogue, start_ns, end_ns)
     return Mission(
-        name=_log_name(catalogue, directory),
+        log=stated_path(catalogue.path, directory),
         catalogue=catalogue,
         frame=frame,
         agents=agents,
@@ -313,25 +321,13 @@ def _obstacle(entry: JsonDict) -> Obstacle:
     return Obstacle(name, tuple(np.asarray(ring, dtype=np.float64).reshape(-1, 2) for ring in entry["rings_m"]))
 
 
-def _log_name(catalogue: JsonDict, directory: Path) -> str:
-    for key in ("log", "path", "source", "source_path"):
-        value = catalogue.get(key)
-        value = value.get("path") if isinstance(value, dict) else value
-        if isinstance(value, str) and value:
-            return Path(value).name
-    return directory.name
-
-
-def _time_range(catalogue: JsonDict, points: list[Points], rows: tuple[WindowRow, ...]) -> tuple[int, int]:
+def _time_range(catalogue: Catalogue, points: list[Points], rows: tuple[WindowRow, ...]) -> tuple[int, int]:
     times = [int(time) for found in points if len(found) for time in (found.time_ns[0], found.time_ns[-1])]
     times += [rows[0].origin_ns, rows[-1].origin_ns] if rows else []
-    return (min(times), max(times)) if times else (int(catalogue.get("start_ns") or 0), int(catalogue.get("end_ns") or 0))
+    return (min(times), max(times)) if times else (catalogue.start_ns, catalogue.end_ns)
 
 
-def _log_range(catalogue: JsonDict, start_ns: int, end_ns: int) -> tuple[int, int]:
-    """The log's own range; start and end where it has none, or other clocks than the stamps of the detections."""
-    first, last = catalogue.get("start_ns"), catalogue.get("end_ns")
-    if not isinstance(first, int) or not isinstance(last, int):
-        return start_ns, end_ns
-    is_same_clock = first <= end_ns and start_ns <= last
-    return (first, last) if is_same_clock else (start_ns, end_ns)
+def _log_range(catalogue: Catalogue, start_ns: int, end_ns: int) -> tuple[int, int]:
+    """The log's own range; start and end where its clock is another one than that of the detections' stamps."""
+    is_same_clock = catalogue.start_ns <= end_ns and start_ns <= catalogue.end_ns
+    return (catalogue.start_ns, catalogue.end_ns) if is_same_clock else (start_ns, end_ns)

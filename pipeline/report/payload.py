@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.arrays import Column, Float64s
+from cadence.arrays import Float64s
+from pipeline.arrays import Column
 from pipeline.report.fans import FanCode
 from pipeline.report.geodesy import GeodesyFit
 from pipeline.report.mission import Mission, Points, WindowRow

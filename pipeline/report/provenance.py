@@ -17,14 +17,10 @@ def provenance_section(mission: Mission) -> str:
     return section("Settings and provenance", f"<details><summary>Show</summary>{''.join(parts)}</details>")
 
 
-def _log_path(mission: Mission) -> str:
-    return str(mission.catalogue.get("path") or mission.name)
-
-
 def _repeat(mission: Mission) -> str:
     configs = {stage: manifest.get("config") for stage, manifest in mission.manifests.items() if stage != "evaluate"}
     toml = as_toml({stage: config for stage, config in configs.items() if isinstance(config, dict) and config})
-    command = f"cadence run {shlex.quote(_log_path(mission))} --out results --config repeat.toml"
+    command = f"cadence run {shlex.quote(mission.log)} --out results --config repeat.toml"
     return (
         f"<h3>To repeat this run</h3><p>Save the settings below as repeat.toml, then:</p><pre>{text(command)}</pre>"
         f"<details><summary>repeat.toml</summary><pre>{escape(toml)}</pre></details>"
@@ -32,9 +28,7 @@ def _repeat(mission: Mission) -> str:
 
 
 def _source(mission: Mission) -> str:
-    rows = [("log", text(_log_path(mission)))]
-    if "sha256" in mission.catalogue:
-        rows.append(("SHA-256 of the log", f"<code>{text(mission.catalogue['sha256'])}</code>"))
+    rows = [("log", text(mission.log)), ("SHA-256 of the log", f"<code>{text(mission.catalogue.sha256)}</code>")]
     infer = mission.manifests.get("infer", {})
     for key, value in dict([*flatten(infer.get("config", {})), *flatten(infer.get("summary", {}))]).items():
         if any(word in key for word in MODEL_WORDS):

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from pipeline.arrays import Float64s
+from cadence.arrays import Float64s
 from pipeline.manifest import JsonObject, StageResult, run_stage
 from pipeline.progress import Progress
 from pipeline.report.analysis import Analyser, Analysis, Moment, choose_moments, shape_of, shown_share

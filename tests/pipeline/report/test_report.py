@@ -124,12 +124,7 @@ def test_what_a_log_names_itself_stays_text(mission: Path) -> None:
     catalogue = json.loads((mission / "catalogue.json").read_text())
     catalogue["path"] = f"/logs/{HOSTILE[0].replace('/', '')}.mcap"
     catalogue["channels"][0]["topic"] = HOSTILE[1]
-    catalogue["health"] = {
-        "is_complete": False,
-        "problems": [HOSTILE[0]],
-        "lost_spans_ns": [[0, 10**9]],
-        HOSTILE[1]: HOSTILE[0],
-    }
+    catalogue["health"] |= {"is_complete": False, "problems": [HOSTILE[0]], "lost_spans_ns": [[0, 10**9]]}
     rewrite(mission, "catalogue.json", json.dumps(catalogue))
     (mission / "obstacles.json").write_text(
         json.dumps({"version": 1, "obstacles": [{"kind": "circle", "x_m": 1, "y_m": 2, "radius_m": 3, "name": HOSTILE[0]}]})
@@ -267,8 +262,10 @@ def test_windows_without_any_hypotheses_are_skipped_on_the_map(mission: Path) ->
     ("name", "content", "words"),
     [
         ("catalogue.json", None, "not found"),
-        ("catalogue.json", "{", "not readable JSON"),
-        ("catalogue.json", "[]", "expected a JSON object"),
+        ("catalogue.json", "{", "cannot be read"),
+        ("catalogue.json", "[]", "has version None, expected 1"),
+        ("scores.json", "{", "not readable JSON"),
+        ("scores.json", "[]", "expected a JSON object"),
         ("obstacles.json", '{"obstacles": [{"kind": "circle"}]}', "not a list of obstacles"),
         ("obstacles.json", '{"obstacles": 3}', "not a list of obstacles"),
         ("detections.parquet", None, "not found"),
@@ -277,7 +274,7 @@ def test_windows_without_any_hypotheses_are_skipped_on_the_map(mission: Path) ->
     ],
 )
 def test_bad_input_is_one_line_and_leaves_no_page(mission: Path, name: str, content: str | None, words: str) -> None:
-    (mission / name).unlink()
+    (mission / name).unlink(missing_ok=True)
     if content is not None:
         rewrite(mission, name, content)
     before = sorted(path.name for path in mission.iterdir())
