@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
+from cadence.arrays import Int64s
 from cadence.errors import ConfigError
 from cadence.recordings import Recordings
-from pipeline.arrays import Int64s
 from pipeline.episodes.recordings import RecordingsConfig, load_recordings
 from pipeline.progress import Progress
 

@@ -11,9 +11,9 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from cadence.arrays import Float64s, Int64s
 from cadence.errors import InputError
 from cadence.recordings import Recordings
-from pipeline.arrays import Float64s, Int64s
 from pipeline.documents import parse_json
 from pipeline.extract.config import ExtractConfig
 from pipeline.extract.stage import write_tables

@@ -16,6 +16,7 @@ import numpy as np
 from cadence.constraints.obstacles import Obstacles
 from cadence.errors import CadenceError, InputError
 from cadence.recordings import Recordings
+from cadence.worlds.terrain import Terrain
 from pipeline.config import config_as_dict
 from pipeline.episodes.recorded_logs import Gridding, LogEpisodes, read_log_episodes
 from pipeline.extract.config import ExtractConfig
@@ -222,6 +223,11 @@ class _World:
     obstacles: Obstacles
     scale_m: float
 
+    @staticmethod
+    def on(terrain: Terrain, config: object, simulate: Callable[[Sequence[int]], Recordings]) -> "_World":
+        """The world with the obstacles and the side of its terrain."""
+        return _World(config, simulate, as_obstacles(obstacles_as_json(terrain)), terrain.side_m)
+
 
 def _of_world(config: RecordingsConfig, cache: Path, progress: Progress) -> RecordingSet:
     """Simulated episodes, a block of indices after the other; blocks that are in the cache are not made again."""
@@ -268,31 +274,18 @@ def _world(config: RecordingsConfig) -> _World:
 
         rendezvous = RendezvousConfig()
         terrain = simulate_rendezvous(rendezvous, config.seed, 0).terrain
-        return _World(
-            rendezvous,
-            lambda indices: simulate_rendezvous_batch(rendezvous, config.seed, indices).recordings,
-            as_obstacles(obstacles_as_json(terrain)),
-            terrain.side_m,
+        return _World.on(
+            terrain, rendezvous, lambda indices: simulate_rendezvous_batch(rendezvous, config.seed, indices).recordings
         )
     if config.world == "prison":
         from cadence.worlds.prison import PrisonConfig, simulate_prison, simulate_prison_batch
 
         prison = PrisonConfig(set=config.set)
         terrain = simulate_prison(prison, config.seed, 0).terrain
-        return _World(
-            prison,
-            lambda indices: simulate_prison_batch(prison, config.seed, np.asarray(indices)),
-            as_obstacles(obstacles_as_json(terrain)),
-            terrain.side_m,
-        )
+        return _World.on(terrain, prison, lambda indices: simulate_prison_batch(prison, config.seed, np.asarray(indices)))
     from cadence.worlds.narco import NarcoConfig, simulate_narco, simulate_narco_batch
 
     assert config.set != "med"  # refused by the configuration
     narco = NarcoConfig(set=config.set)
     terrain = simulate_narco(narco, config.seed, 0).terrain
-    return _World(
-        narco,
-        lambda indices: simulate_narco_batch(narco, config.seed, np.asarray(indices)),
-        as_obstacles(obstacles_as_json(terrain)),
-        terrain.side_m,
-    )
+    return _World.on(terrain, narco, lambda indices: simulate_narco_batch(narco, config.seed, np.asarray(indices)))

@@ -1,7 +1,6 @@
 """Training of the general preset: windows of synthetic kinematics made on the fly, or of logs with truth."""
 
 from pathlib import Path
-from typing import Protocol
 
 import torch
 
@@ -15,13 +14,12 @@ from pipeline.estimators.fitting import FittingData
 from pipeline.manifest import StageResult
 from pipeline.progress import Progress
 from pipeline.train.config import TrainConfig
-from pipeline.train.lessons import Lessons, in_parts
+from pipeline.train.lessons import Source, lessons_of
 from pipeline.train.missions import TrainingMission, missions_of_logs
 from pipeline.train.run import TrainingRun, run_training
 from pipeline.train.shards import synthetic_shard
 from pipeline.windows import GridConfig, build_windows, plan_grid, truth_on_grid
 
-_VALIDATION_BATCH = 256
 _VALIDATION_SHARE = 0.1
 _STEPS_A_SHARD = 120
 """New shards join at this pace, so that making them does not hold up the start."""
@@ -30,20 +28,11 @@ _MAX_GAP_STEPS = 4.0
 
 def train_general(out: Path, config: TrainConfig, progress: Progress, force: bool = False) -> StageResult:
     """Train the general preset into `out`; see `pipeline.train.stage.train`. `config.data` None means synthetic kinematics."""
-    source: _Source = _LogSource(out, config, progress) if config.data is not None else _SyntheticSource(out, config)
+    is_of_logs = config.data is not None
+    source: Source[ResidualWindows] = _LogSource(out, config, progress) if is_of_logs else _SyntheticSource(out, config)
     trainer = Trainer(untrained(lambda: ResidualNetwork(config.network), config.seed), config.optimiser)
-    parts = in_parts(source.validation, _VALIDATION_BATCH)
-    lessons = Lessons(source.batch, residual_loss, parts)
     run = TrainingRun(out, "general", config, config.network, config.optimiser.num_steps)
-    return run_training(run, trainer, lessons, progress, force)
-
-
-class _Source(Protocol):
-    """Where windows come from."""
-
-    validation: ResidualWindows
-
-    def batch(self, step: int, generator: torch.Generator) -> ResidualWindows: ...
+    return run_training(run, trainer, lessons_of(source, residual_loss), progress, force)
 
 
 class _SyntheticSource:
@@ -73,8 +62,6 @@ class _LogSource:
     def __init__(self, out: Path, config: TrainConfig, progress: Progress) -> None:
         assert config.data is not None
         missions = missions_of_logs(config.data, out / "logs", config.extract, progress)
-        if len(missions) < 2:
-            raise InputError(f"{config.data}: one usable log; at least two are needed, as whole logs are kept for validation")
         order = numpy_stream(config.seed, "missions").permutation(len(missions)).tolist()
         parts = [mission_windows(missions[index], config, derived_seed(config.seed, "mission", index)) for index in order]
         usable = [part for part in parts if part is not None]

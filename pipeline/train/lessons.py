@@ -10,6 +10,8 @@ from torch import Tensor, nn
 from cadence.seeds import torch_stream
 from cadence.training.loop import Loss
 
+_VALIDATION_BATCH = 256
+
 
 class Windows(Protocol):
     """Training windows of any preset."""
@@ -54,6 +56,19 @@ class _Sliceable(Windows, Protocol):
 
 
 S = TypeVar("S", bound=_Sliceable)
+
+
+class Source(Protocol[S]):
+    """Where windows come from: those of a step, which depend on nothing but it and the generator, and those kept apart."""
+
+    validation: S
+
+    def batch(self, step: int, generator: torch.Generator) -> S: ...  # noqa: D102
+
+
+def lessons_of(source: Source[S], loss: Callable[[nn.Module, S, torch.Generator], Tensor]) -> Lessons[S]:
+    """The loss on the windows of a source."""
+    return Lessons(source.batch, loss, in_parts(source.validation, _VALIDATION_BATCH))
 
 
 def in_parts(windows: S, size: int) -> list[S]:

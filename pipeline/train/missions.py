@@ -28,7 +28,8 @@ class TrainingMission:
 def missions_of_logs(data: Path, cache: Path, config: ExtractConfig, progress: Progress) -> list[TrainingMission]:
     """Every log in the folder `data` that has truth and detections, by name; their tables are kept in `cache`.
 
-    Logs that cannot be used are named and left out. Raises `InputError` where none is left.
+    Logs that cannot be used are named and left out. Raises `InputError` where fewer than two are left: one trains, the other
+    validates.
     """
     if not data.is_dir():
         raise InputError(f"{data}: not a folder; train.data is a folder of MCAP logs with truth")
@@ -48,6 +49,8 @@ def missions_of_logs(data: Path, cache: Path, config: ExtractConfig, progress: P
             bar.update(1)
     if not missions:
         raise InputError(f"{data}: no log in it has detections and truth; map them in [train.extract]")
+    if len(missions) < 2:
+        raise InputError(f"{data}: one usable log; at least two are needed, as whole logs are kept for validation")
     return missions
 
 

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from cadence.arrays import Float64s, Int64s
 from cadence.bank.rows import active_rows
 from cadence.diffusion.absolute import AbsoluteConfig, detection_rows
 from cadence.errors import ConfigError, InputError
@@ -20,17 +21,16 @@ from cadence.seeds import derived_seed, numpy_stream, torch_stream
 from cadence.training.absolute import AbsoluteWindows, absolute_loss, forecast_rows, join_absolute
 from cadence.training.loop import Trainer, untrained
 from cadence.worlds.patrol import simulate_patrol
-from pipeline.arrays import Column, Float64s, Int64s
+from pipeline.arrays import Column
 from pipeline.episodes.pool import load_pool
 from pipeline.manifest import StageResult
 from pipeline.progress import Progress
 from pipeline.train.config import AbsoluteTraining, TrainConfig
-from pipeline.train.lessons import Lessons, in_parts
+from pipeline.train.lessons import Source, lessons_of
 from pipeline.train.missions import TrainingMission, mission_of_episode, missions_of_logs
 from pipeline.train.run import TrainingRun, run_training
 from pipeline.windows import Grid, MissionWindows, build_windows, truth_on_grid
 
-_VALIDATION_BATCH = 256
 _STEPS_AN_EPISODE = 10
 """A new simulated episode joins after this many steps, so that simulating does not hold up the start."""
 _FIRST_EPISODES = 8
@@ -51,21 +51,14 @@ def train_absolute(out: Path, config: TrainConfig, progress: Progress, force: bo
         assert isinstance(network, TrajectoryNetwork)
         return absolute_loss(network, windows, schedule, generator)
 
-    parts = in_parts(source.validation, _VALIDATION_BATCH)
-    lessons = Lessons(source.batch, loss, parts)
     run = TrainingRun(out, "paper", config, source.model, config.optimiser.num_steps)
-    return run_training(run, trainer, lessons, progress, force)
+    return run_training(run, trainer, lessons_of(source, loss), progress, force)
 
 
-class _Source(Protocol):
-    """Where batches come from."""
+class _Source(Source[AbsoluteWindows], Protocol):
+    """Windows, and the model whose units they are in."""
 
     model: AbsoluteConfig
-    validation: AbsoluteWindows
-
-    def batch(self, step: int, generator: torch.Generator) -> AbsoluteWindows:
-        """The windows of a step, which depend on nothing but it and the generator."""
-        ...
 
 
 def _source(out: Path, config: TrainConfig, progress: Progress) -> _Source:
@@ -119,8 +112,6 @@ class _LogSource:
         assert config.data is not None
         paper = config.paper
         missions = missions_of_logs(config.data, out / "logs", config.extract, progress)
-        if len(missions) < 2:
-            raise InputError(f"{config.data}: one usable log; at least two are needed, as whole logs are kept for validation")
         order = numpy_stream(config.seed, "missions").permutation(len(missions))
         num_validation = min(max(1, round(paper.validation_share * len(missions))), len(missions) - 1)
         kept = [missions[index] for index in sorted(order[num_validation:])]

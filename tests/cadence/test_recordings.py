@@ -2,21 +2,13 @@
 
 import numpy as np
 import pytest
+from fixtures.recordings import random_recordings
 
 from cadence.recordings import NUM_STEPS, Recordings, choose_windows, cut_windows
 
 
 def recordings(seed: int = 0, lengths: tuple[int, ...] = (40, 7, 200)) -> Recordings:
-    rng = np.random.default_rng(seed)
-    num = sum(lengths)
-    return Recordings(
-        60.0,
-        np.concatenate([[0], np.cumsum(lengths)]),
-        rng.uniform(0, 1000, (num, 2)).astype(np.float32),
-        rng.random(num) < 0.3,
-        rng.uniform(0, 1000, (num, 3, 2)).astype(np.float32),
-        rng.uniform(0, 1000, (len(lengths), 2)).astype(np.float32),
-    )
+    return random_recordings(seed, lengths, 0.3)
 
 
 @pytest.mark.parametrize("known_start", [True, False])

@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
+from fixtures.recordings import random_recordings
 from torch import distributions
 
 from cadence.baselines.grammi import GrammiNetwork, GrammiNetworkConfig, PoolingConvolution
@@ -23,7 +24,7 @@ from cadence.baselines.recurrence import run_recurrence
 from cadence.baselines.vrnn import VrnnNetwork, VrnnNetworkConfig
 from cadence.errors import ConfigError
 from cadence.network.encoder import DetectionEncoder
-from cadence.recordings import Recordings, choose_windows, cut_windows
+from cadence.recordings import choose_windows, cut_windows
 from cadence.training.mixtures import grammi_loss, hidden_goals, mixture_windows, vrnn_loss
 from cadence.types import Context
 
@@ -34,16 +35,7 @@ VRNN = VrnnNetworkConfig(hidden_size=8, latent_size=3, history=dataclasses.repla
 
 
 def recordings(seed=0, lengths=(150, 40, 300)):
-    rng = np.random.default_rng(seed)
-    num = sum(lengths)
-    return Recordings(
-        60.0,
-        np.concatenate([[0], np.cumsum(lengths)]),
-        rng.uniform(0, 1000, (num, 2)).astype(np.float32),
-        rng.random(num) < 0.2,
-        rng.uniform(0, 1000, (num, 3, 2)).astype(np.float32),
-        rng.uniform(0, 1000, (len(lengths), 2)).astype(np.float32),
-    )
+    return random_recordings(seed, lengths, 0.2)
 
 
 def windows(num=12, seed=0, **changes):
