@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from cadence.arrays import Float64s
 from cadence.metrics import Interval
-from pipeline.arrays import Float64s
 from pipeline.forecast.scores import HORIZONS, EpisodeScores
 from pipeline.forecast.tables import comparison
 

@@ -1,18 +1,8 @@
-"""Names of numpy array types, by what they hold; shapes and units stand with whatever bears them."""
+"""Names of numpy array types beside those of `cadence.arrays`; shapes and units stand with whatever bears them."""
 
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
-
-Float64s = NDArray[np.float64]
-Float32s = NDArray[np.float32]
-Floats = NDArray[np.floating]
-Int64s = NDArray[np.int64]
-Int32s = NDArray[np.int32]
-Indices = NDArray[np.intp]
-Bools = NDArray[np.bool_]
-Objects = NDArray[np.object_]
 
 Column = NDArray[Any]
 """Values of one field of many messages or rows, of whatever type the field has."""

@@ -14,6 +14,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import torch
 
+from cadence.arrays import Float64s, Int64s
 from cadence.association.associate import associate
 from cadence.association.fitting import fit_habits
 from cadence.association.particles import Stream
@@ -24,7 +25,6 @@ from cadence.errors import InputError
 from cadence.resampling import systematic
 from cadence.seeds import part_seeds
 from cadence.types import WindowBatch
-from pipeline.arrays import Float64s, Int64s
 from pipeline.tracks import DetectionTrack, track_of
 from pipeline.windows import (
     Grid,

@@ -14,8 +14,8 @@ import functools
 import numpy as np
 from pyproj import Transformer
 
+from cadence.arrays import Float64s
 from cadence.errors import InputError
-from pipeline.arrays import Float64s
 from pipeline.tables import Frame
 
 GEOREFERENCED_FRAME_ID = "mission"

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 
+from cadence.arrays import Float32s, Float64s, Int32s, Int64s
 from cadence.errors import InputError
-from pipeline.arrays import Float32s, Float64s, Int32s, Int64s
 from pipeline.tables import Frame, read_table
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from pipeline.arrays import Bools, Float64s, Int64s
+from cadence.arrays import Bools, Float64s, Int64s
 
 UNKNOWN_AGENT = "unknown"
 """Name of the one agent that detections of unknown origin are taken to belong to where they are not told apart

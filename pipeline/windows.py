@@ -13,10 +13,10 @@ import pyarrow as pa
 import torch
 from torch import Tensor
 
+from cadence.arrays import Bools, Float64s, Int64s
 from cadence.constraints.obstacles import Obstacles
 from cadence.errors import ConfigError, InputError
 from cadence.types import Context, Detections, WindowBatch
-from pipeline.arrays import Bools, Float64s, Int64s
 from pipeline.tracks import DetectionTrack, agent_tracks, interpolated
 
 _NICE = np.array([1.0, 1.2, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0])

@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from cadence import metrics
+from cadence.arrays import Float64s, Int32s, Int64s
 from cadence.types import HypothesisSet, WindowBatch
-from pipeline.arrays import Float64s, Int32s, Int64s
 from pipeline.scoring.matching import matched
 from pipeline.scoring.scores import PARTS, Draw, ScoreRow, detection_distances, weight_by_agent
 

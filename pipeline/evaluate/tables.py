@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.arrays import Int64s
+from cadence.arrays import Int64s
 from pipeline.evaluate.joint import JOINT_METRICS, JointCells, block_of, summarise_joint
 from pipeline.plain_rows import rows_as_csv, without_nan
 from pipeline.score_words import estimator_words

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.arrays import Bools, Float64s, Int64s
+from cadence.arrays import Bools, Float64s, Int64s
 from pipeline.export import numbers
 from pipeline.export.playback import LiveAgent, Scene
 from pipeline.export.scene import Entity, Label, Lines, LineType, Spheres, round_positions

@@ -8,7 +8,7 @@ import numpy as np
 import shapely
 from shapely.geometry.base import BaseGeometry
 
-from pipeline.arrays import Float64s, Indices
+from cadence.arrays import Float64s, Indices
 from pipeline.export import numbers
 from pipeline.export.display import Style
 from pipeline.export.playback import LiveAgent, Scene, Tick, shows_new_scene

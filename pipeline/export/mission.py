@@ -9,7 +9,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from pipeline.arrays import Float64s
+from cadence.arrays import Float64s
 from pipeline.catalogue import Catalogue
 from pipeline.export.config import ExportConfig
 from pipeline.export.display import Marks, Style

@@ -4,7 +4,7 @@ import numpy as np
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
-from pipeline.arrays import Float64s
+from cadence.arrays import Float64s
 
 _MODE_SHARE = 0.1
 """Smaller groups of hypotheses are stragglers, not modes."""

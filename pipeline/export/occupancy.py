@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.arrays import Float64s
+from cadence.arrays import Float64s
 from pipeline.export.playback import LiveAgent
 
 _CELLS_OF_A_FUTURE = 96

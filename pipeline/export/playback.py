@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from pipeline.arrays import Float64s, Indices
+from cadence.arrays import Float64s, Indices
 from pipeline.export import numbers
 from pipeline.results import AgentHypotheses, MissionHypotheses, WindowHypotheses
 

@@ -15,7 +15,7 @@ from enum import IntEnum
 
 import numpy as np
 
-from pipeline.arrays import Float64s, Floats
+from cadence.arrays import Float64s, Floats
 from pipeline.logs.wire import DOUBLE, field, varint
 
 

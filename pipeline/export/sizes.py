@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from pipeline.arrays import Float64s
+from cadence.arrays import Float64s
 from pipeline.export.playback import LiveAgent, Scene
 
 _SHARE_OF_REACH = 0.01

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from pipeline.arrays import Bools, Float64s
+from cadence.arrays import Bools, Float64s
 
 
 def visible_vertices(track_m: Float64s, origin_index: int, tolerance_m: float) -> Bools:

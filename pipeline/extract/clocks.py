@@ -10,7 +10,7 @@ from typing import Final
 
 import numpy as np
 
-from pipeline.arrays import Bools, Float64s, Int64s, Objects
+from cadence.arrays import Bools, Float64s, Int64s, Objects
 from pipeline.extract.positions import numbered
 
 AHEAD_S: Final = 2.0

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline.arrays import Bools, Float64s, Int32s, Int64s
+from cadence.arrays import Bools, Float64s, Int32s, Int64s
 from pipeline.extract.covariances import are_apart
 from pipeline.extract.positions import Positions
 

@@ -8,7 +8,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from pipeline.arrays import Bools, Float64s
+from cadence.arrays import Bools, Float64s
 
 Covariance = tuple[float, float, float, float, float, float]
 

@@ -6,7 +6,7 @@ from typing import Final
 
 import numpy as np
 
-from pipeline.arrays import Bools
+from cadence.arrays import Bools
 from pipeline.extract.positions import Positions
 from pipeline.frames import DEGREE_M
 from pipeline.suspicions import Suspicions

@@ -12,7 +12,7 @@ import numpy as np
 import shapely
 from shapely.affinity import affine_transform
 
-from pipeline.arrays import Bools
+from cadence.arrays import Bools
 from pipeline.logs.decode import field
 
 ROS_GRIDS: Final = ("nav_msgs/msg/OccupancyGrid", "nav_msgs/OccupancyGrid")

@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipeline.arrays import Bools, Int64s
+from cadence.arrays import Bools, Int64s
 from pipeline.extract.clocks import MIN_ROWS, Clock, Judgement, Stamps, judge, strays
 from pipeline.extract.positions import ChannelReader, Positions
 from pipeline.mapping.sources import LOG_TIME, PUBLISH_TIME

@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 from scipy.spatial import cKDTree
 
-from pipeline.arrays import Bools, Int64s
+from cadence.arrays import Bools, Int64s
 from pipeline.extract.covariances import are_apart
 from pipeline.extract.positions import Positions
 from pipeline.suspicions import Suspicions, listed

@@ -15,8 +15,9 @@ from typing import Any, Self
 
 import numpy as np
 
+from cadence.arrays import Bools, Float32s, Float64s, Int64s, Objects
 from cadence.errors import ConfigError
-from pipeline.arrays import Bools, Column, Float32s, Float64s, Int64s, Objects
+from pipeline.arrays import Column
 from pipeline.extract.columns import FieldColumns, mapped
 from pipeline.extract.covariances import (
     NONE_COVARIANCE,

@@ -10,7 +10,7 @@ from typing import Final
 
 import numpy as np
 
-from pipeline.arrays import Int64s, Objects
+from cadence.arrays import Int64s, Objects
 from pipeline.extract.names import Naming
 from pipeline.extract.positions import Names, Positions
 from pipeline.extract.tracks import Jump, Track, apart_m, odd_share, pieces_of

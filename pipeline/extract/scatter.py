@@ -11,7 +11,7 @@ from typing import Final
 
 import numpy as np
 
-from pipeline.arrays import Float64s, Int64s
+from cadence.arrays import Float64s, Int64s
 from pipeline.extract.positions import Positions, numbered
 from pipeline.suspicions import Suspicions
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from pipeline.arrays import Bools
+from cadence.arrays import Bools
 from pipeline.extract.positions import Positions
 
 _MIN_DISTANCE_M = 1000.0

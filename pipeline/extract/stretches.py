@@ -6,7 +6,7 @@ from typing import Final
 
 import numpy as np
 
-from pipeline.arrays import Int64s
+from cadence.arrays import Int64s
 from pipeline.extract.mission_clock import TRUSTED
 from pipeline.extract.positions import ChannelReader, Positions
 from pipeline.logs.health import utc

@@ -5,7 +5,7 @@ from typing import Any
 
 import pyarrow as pa
 
-from pipeline.arrays import Objects
+from cadence.arrays import Objects
 from pipeline.extract.collapse import Collapsed
 from pipeline.extract.positions import Positions
 from schemas.tables import DETECTIONS

@@ -6,7 +6,7 @@ from typing import Literal
 
 import numpy as np
 
-from pipeline.arrays import Bools, Float64s, Int64s
+from cadence.arrays import Bools, Float64s, Int64s
 
 
 @dataclass(frozen=True)

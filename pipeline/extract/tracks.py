@@ -11,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.arrays import Bools, Float64s, Int64s
+from cadence.arrays import Bools, Float64s, Int64s
 
 _MAX_ACCELERATION_MPS2: Final = 10.0
 """One g: more than ships, people, cars and airliners do. Whatever does more is fast before and after, too."""

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from pipeline.arrays import Bools, Float64s, Int64s
+from cadence.arrays import Bools, Float64s, Int64s
 from pipeline.frames import EARTH_CENTRED
 
 _EARTH = EARTH_CENTRED | {"utm", "wgs84"}

@@ -6,7 +6,7 @@ from typing import Final, Literal
 
 import numpy as np
 
-from pipeline.arrays import Bools, Float64s
+from cadence.arrays import Bools, Float64s
 from pipeline.extract.positions import Positions, numbered
 from pipeline.frames import DEGREE_M, EARTH_CENTRED
 from pipeline.mapping.sources import Unit

@@ -9,8 +9,8 @@ from typing import Final
 
 import numpy as np
 
+from cadence.arrays import Bools
 from cadence.errors import ConfigError
-from pipeline.arrays import Bools
 from pipeline.extract.covariances import rotated
 from pipeline.extract.positions import Positions
 from pipeline.extract.unit_evidence import (

@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.arrays import Bools, Column
+from cadence.arrays import Bools
+from pipeline.arrays import Column
 from pipeline.extract.columns import CONDITION, mapped
 from pipeline.mapping.conditions import Condition, parse_conditions
 from pipeline.mapping.message_path import MessagePath, MissingFieldError, Place, at_place

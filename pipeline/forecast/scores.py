@@ -13,10 +13,10 @@ import torch
 from torch import Tensor
 
 from cadence import metrics
+from cadence.arrays import Float64s, Int64s
 from cadence.constraints.checker import segments_in_collision, states_in_collision
 from cadence.constraints.obstacles import Obstacles
 from cadence.types import HypothesisSet
-from pipeline.arrays import Float64s, Int64s
 
 HORIZONS = (0, 29, 59, 89, 119)
 """Steps of a window at which the paper reads its scores: the columns 0, 30, 60, 90 and 120 min of its table."""

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from cadence.arrays import Float64s
 from cadence.metrics import Interval, bootstrap_ratio
-from pipeline.arrays import Float64s
 from pipeline.forecast.scores import HORIZONS, MEASURES, EpisodeScores, step_quantiles
 from pipeline.plain_rows import rows_as_csv, without_nan
 

@@ -8,8 +8,8 @@ from typing import Any, Final
 
 import numpy as np
 
+from cadence.arrays import Int64s
 from cadence.errors import InputError, NothingDetectedError
-from pipeline.arrays import Int64s
 from pipeline.catalogue import (
     CATALOGUE_VERSION,
     Catalogue,

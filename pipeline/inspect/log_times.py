@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from pipeline.arrays import Int64s
+from cadence.arrays import Int64s
 from pipeline.logs.health import utc
 from pipeline.logs.reader import Batch, MissionLog
 

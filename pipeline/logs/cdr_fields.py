@@ -12,7 +12,8 @@ import numpy as np
 from rosbags.interfaces import Nodetype
 from rosbags.typesys.store import Typestore
 
-from pipeline.arrays import Bools, Column, Int64s
+from cadence.arrays import Bools, Int64s
+from pipeline.arrays import Column
 from pipeline.logs.channels import Batch, Channel
 from pipeline.logs.decode import UndecodableChannel, cdr_types
 

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.arrays import Int64s
+from cadence.arrays import Int64s
 from pipeline.logs.rows import Rows
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from mcap.opcode import Opcode
 
-from pipeline.arrays import Int64s
+from cadence.arrays import Int64s
 from pipeline.logs.records import HEAD, INDEX_ENTRY, MAX_TIME_NS, MESSAGE, MESSAGE_HEAD, DamagedRecord, walk
 
 Index = Sequence[tuple[int, npt.NDArray[np.void]]]

@@ -14,8 +14,8 @@ from typing import BinaryIO, Final, Literal
 
 import numpy as np
 
+from cadence.arrays import Int64s
 from cadence.errors import InputError
-from pipeline.arrays import Int64s
 from pipeline.logs.channels import Batch, Channel, RawMessage, batches_of, raw_messages
 from pipeline.logs.packed import unpacked
 from pipeline.logs.plan import Block

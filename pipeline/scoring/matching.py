@@ -8,8 +8,8 @@ import torch
 from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
+from cadence.arrays import Float64s
 from cadence.types import Detections, HypothesisSet, WindowBatch
-from pipeline.arrays import Float64s
 from pipeline.tracks import agent_tracks, interpolated
 from pipeline.windows import MissionWindows
 

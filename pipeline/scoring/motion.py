@@ -11,8 +11,8 @@ import torch
 from scipy.stats import wasserstein_distance
 from torch import Tensor
 
+from cadence.arrays import Float64s
 from cadence.types import HypothesisSet, WindowBatch
-from pipeline.arrays import Float64s
 from pipeline.scoring.scores import Draw, ScoreRow, detection_distances, weight_by_agent
 
 MOTION_METRICS = {"speed_w1_mps": "speed", "acceleration_w1_mps2": "acceleration", "turn_w1_deg": "turn"}

@@ -15,8 +15,8 @@ import torch
 from torch import Tensor
 
 from cadence import metrics
+from cadence.arrays import Bools, Float64s, Int32s, Int64s
 from cadence.types import Estimator, HypothesisSet, WindowBatch
-from pipeline.arrays import Bools, Float64s, Int32s, Int64s
 
 METRICS = (
     "ade_m", "min_ade_m", "mean_error_m", "energy_score_m", "energy_score_fair_m", "trajectory_energy_score_m",

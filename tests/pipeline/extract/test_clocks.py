@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pipeline.arrays import Float64s
+from cadence.arrays import Float64s
 from pipeline.extract.clocks import Clock, Judgement, Stamps, judge
 
 START_S = 1_720_000_000.0
