@@ -105,7 +105,7 @@ def test_episodes_with_another_step_are_refused(sources, tmp_path):
 
 def test_infer_takes_a_place_checkpoint(sources, tmp_path, mission_directory):
     weights = train(tmp_path / "place", config(sources), QUIET).outputs[0]
-    settings = InferConfig(num_hypotheses=3, checkpoint=str(weights), place=PlaceSampling(num_steps=2))
+    settings = InferConfig(num_hypotheses=3, checkpoint=str(weights), place=PlaceSampling(num_steps=2), is_tested=False)
     result = infer(mission_directory, settings, QUIET)
     assert result.summary["preset"] == "place" and result.summary["step_s"] == pytest.approx(60.0)
     table, _ = read_table(mission_directory / "hypotheses.parquet", "hypotheses")
@@ -122,7 +122,8 @@ def test_infer_takes_a_place_checkpoint(sources, tmp_path, mission_directory):
 
 def test_all_that_infer_saw_is_seen_by_those_it_is_compared_with(sources, tmp_path, mission_directory):
     weights = train(tmp_path / "place", config(sources), QUIET).outputs[0]
-    infer(mission_directory, InferConfig(num_hypotheses=3, checkpoint=str(weights), place=PlaceSampling(num_steps=2)), QUIET)
+    settings = InferConfig(num_hypotheses=3, checkpoint=str(weights), place=PlaceSampling(num_steps=2), is_tested=False)
+    infer(mission_directory, settings, QUIET)
     rows = [
         {"log_id": "walk", "time_ns": START_NS + minute * 60 * 10**9, "agent_id": agent, "x_m": 30.0 * minute, "y_m": y_m}
         for minute in range(300) for agent, y_m in (("T0", 0.0), ("T1", 500.0))
@@ -144,7 +145,8 @@ def test_the_limits_of_all_presets_hold_for_a_place_checkpoint(sources, tmp_path
     (mission_directory / "obstacles.json").write_text(json.dumps({"version": 1, "obstacles": [rock]}))
 
     def least_distance_and_longest_step(**guidance):
-        settings = InferConfig(num_hypotheses=20, checkpoint=str(weights), guidance=GuidanceConfig(**guidance))
+        limits = GuidanceConfig(**guidance)
+        settings = InferConfig(num_hypotheses=20, checkpoint=str(weights), guidance=limits, is_tested=False)
         infer(mission_directory, settings, QUIET)
         table, _ = read_table(mission_directory / "hypotheses.parquet", "hypotheses")
         place = np.array(table["position_m"].to_pylist()) + np.array([table["datum_x_m"], table["datum_y_m"]]).T[:, None]
