@@ -27,8 +27,9 @@ from benchmarks.publishing import Measurement
 from cadence.bank.bank import BankPosterior
 from cadence.bank.rows import active_rows, scatter_hypotheses
 from cadence.constraints.checker import segments_in_collision
+from cadence.constraints.limits import KeepOut
 from cadence.constraints.obstacles import Obstacles
-from cadence.diffusion.feasible import Feasibility, KeepOut
+from cadence.diffusion.feasible import Feasibility
 from cadence.diffusion.general import GeneralModel
 from cadence.diffusion.guidance import PaperCost, adam_guidance
 from cadence.diffusion.sampler import sample_ddpm

@@ -7,10 +7,10 @@ import torch
 from torch import Tensor
 
 from cadence.constraints import Constraint
+from cadence.constraints.limits import KeepOut, within_limits
 from cadence.constraints.motion import SpeedConstraint
 from cadence.constraints.obstacles import ObstacleConstraint, Obstacles
-from cadence.constraints.repair import repair
-from cadence.constraints.speed import exceeds, limit_steps
+from cadence.constraints.speed import exceeds
 from cadence.diffusion.guidance import clean_estimate_guidance
 from cadence.resampling import systematic
 from cadence.types import WindowBatch
@@ -19,7 +19,6 @@ _PINNED_SHARE = 0.05
 _HELD_SHARE = 0.5
 """Steps that the bank knows to within so many step lengths stay where they are when a track is slowed down."""
 
-_ROUNDS = 4
 _LEAST_WEIGHT = 1e-3
 
 
@@ -40,15 +39,6 @@ class GuidanceConfig:
     def __post_init__(self) -> None:
         if self.margin_m < 0 or (self.max_speed_mps is not None and not self.max_speed_mps > 0):
             raise ValueError("margin_m must not be negative, max_speed_mps must be positive")
-
-
-@dataclass(frozen=True, eq=False)
-class KeepOut:
-    """What is in the way: obstacles, the margin to keep from them, and the datum of the rows in their frame [R, 1, 1, 2]."""
-
-    obstacles: Obstacles
-    margin_m: float
-    offset_m: Tensor
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,33 +123,6 @@ class Feasibility:
         if self.max_speed_mps is not None:
             is_feasible = is_feasible & ~exceeds(moved, self.max_speed_mps * self.step_s)
         return moved, is_feasible
-
-
-def within_limits(
-    position_m: Tensor, keep_out: KeepOut, is_pinned: Tensor, longest_m: float | None, is_held: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Tracks [R, K, T, 2] led around obstacles and slowed down, in turns as often as helps: the one may undo the other.
-
-    Args:
-        position_m: the tracks.
-        keep_out: what is in the way.
-        is_pinned: [R, K, T] steps that a way round an obstacle leaves exactly where they are.
-        longest_m: how long a step may be, or None.
-        is_held: [R, K, T] steps that stay where they are when a track is slowed down; at least one a track.
-
-    Returns:
-        The tracks, and which of them keep clear of the obstacles [R, K]; ask `exceeds` whether they are slow enough.
-    """
-    moved, is_clear = position_m, torch.ones(position_m.shape[:2], dtype=torch.bool)
-    for _ in range(_ROUNDS if keep_out.obstacles.count and longest_m is not None else 1):
-        if longest_m is not None:
-            slowed, _ = limit_steps(moved.flatten(0, 1), is_held.flatten(0, 1), longest_m)
-            moved = slowed.view_as(moved)
-        if keep_out.obstacles.count:
-            moved, is_clear = repair(moved, keep_out.obstacles, is_pinned, keep_out.margin_m, offset_m=keep_out.offset_m)
-        if longest_m is None or not bool((exceeds(moved, longest_m) | ~is_clear).any()):
-            break
-    return moved, is_clear
 
 
 def redrawn(position_m: Tensor, weight: Tensor, is_kept: Tensor, seeds: Tensor, are_all: bool = False) -> tuple[Tensor, Tensor]:

@@ -12,9 +12,10 @@ import torch
 from torch import Tensor
 
 from cadence.bank.rows import scatter_hypotheses
+from cadence.constraints.limits import KeepOut, within_limits
 from cadence.constraints.obstacles import ObstacleConstraint
 from cadence.constraints.speed import exceeds
-from cadence.diffusion.feasible import KeepOut, redrawn, within_limits
+from cadence.diffusion.feasible import redrawn
 from cadence.diffusion.guidance import PaperCost, adam_guidance, clean_estimate_guidance
 from cadence.diffusion.noise import RowNoise
 from cadence.diffusion.place_frame import PlaceConfig, future_of, place_inputs, to_pieces, to_track
@@ -159,24 +160,32 @@ class PlaceModel:
         sampled = tracks.guided(tracks.limited(sampled), "final")
         positions = future_of(to_track(sampled.double(), inputs.pieces, self.config), self.config)
         positions = positions + last_m[:, None, None]
-        if context.obstacles.count and self.sampling.is_repaired:
-            positions = self._repaired(positions, inputs.pieces, windows, team)
+        keep_out = self._keep_out(context, last_m)
+        if (context.obstacles.count or keep_out.edge_m) and self.sampling.is_repaired:
+            positions = self._repaired(positions, keep_out, inputs.pieces, None if team is not None else windows.seeds)
         return positions
 
-    def _repaired(self, positions: Tensor, pieces: Pieces, windows: WindowBatch, team: Team | None) -> Tensor:
-        """Tracks led around the obstacles at a speed that the target has; those that cannot be are drawn again from the others.
+    def _keep_out(self, context: Context, last_m: Tensor) -> KeepOut:
+        """Where tracks of rows that were last seen at last_m [R, 2] may not be; the map reaches at least as far as that."""
+        offset_m = context.datum_m[:, None, None]
+        if self.config.edge_m is None:
+            return KeepOut(context.obstacles, self.sampling.margin_m, offset_m)
+        low, high = (torch.tensor(self.config.edge_m, dtype=torch.float64).view(2, 2) - context.datum_m[:, None]).unbind(1)
+        edge_m = torch.minimum(low, last_m)[:, None, None], torch.maximum(high, last_m)[:, None, None]
+        return KeepOut(context.obstacles, self.sampling.margin_m, offset_m, edge_m)
 
-        Where agents see each other a hypothesis is one of all of them, and none is drawn again for itself.
+    def _repaired(self, positions: Tensor, keep_out: KeepOut, pieces: Pieces, seeds: Tensor | None) -> Tensor:
+        """Tracks within all limits, at a speed that the target has; those that cannot be are drawn again from the others.
+
+        Where agents see each other a hypothesis is one of all of them, and none is drawn again for itself: without seeds.
         """
-        context = windows.required_context("PlaceModel")
-        keep_out = KeepOut(context.obstacles, self.sampling.margin_m, context.datum_m[:, None, None])
         is_first = torch.arange(positions.shape[2]) == 0
         is_pinned = ((pieces.start[:, :1] >= 0) & is_first)[:, None].expand(positions.shape[:-1])
         longest_m = self.config.max_step_m
         moved, is_clear = within_limits(positions, keep_out, is_pinned, longest_m, is_first.expand(positions.shape[:-1]))
         is_kept = is_clear & ~exceeds(moved, longest_m)
-        if team is None:
-            moved, _ = redrawn(moved, torch.ones_like(is_kept, dtype=torch.float64), is_kept, windows.seeds)
+        if seeds is not None:
+            moved, _ = redrawn(moved, torch.ones_like(is_kept, dtype=torch.float64), is_kept, seeds)
         return moved
 
     def _solved(self, denoise: Callable[[Tensor, float], Tensor], start: Tensor, stream: RowNoise, tracks: "_Tracks") -> Tensor:

@@ -33,6 +33,7 @@ class PlaceConfig:
     network      its sizes and inputs
     step_s       seconds between steps
     centre_m, scale_m  of the map: (place - centre) / scale lies within -1 ... 1
+    edge_m       lowest x, y and highest x, y of a map that ends somewhere, which no track leaves; None where no edge is known
     unit_step_m  a coordinate's change in a step that counts as one; about its root mean square
     max_step_m   no step is longer
     num_gap, num_future  pieces from the last detection to now, and from now on
@@ -54,12 +55,15 @@ class PlaceConfig:
     stride: int = 4
     few_steps: int = 0
     shared_gap_steps: int = 0
+    edge_m: tuple[float, float, float, float] | None = None
 
     def __post_init__(self) -> None:
         if self.num_future * self.stride < NUM_STEPS or min(self.num_gap, self.stride) < 1:
             raise ValueError(f"num_future * stride must reach {NUM_STEPS} steps, num_gap be at least 1")
         if min(self.step_s, self.scale_m, self.unit_step_m, self.max_step_m) <= 0:
             raise ValueError("step_s, scale_m, unit_step_m and max_step_m must be positive")
+        if self.edge_m is not None and not (self.edge_m[0] < self.edge_m[2] and self.edge_m[1] < self.edge_m[3]):
+            raise ValueError("edge_m must be the lowest x and y of the map, then the highest")
         if min(self.few_steps, self.shared_gap_steps) < 0:
             raise ValueError("few_steps and shared_gap_steps must not be negative")
         if self.num_pieces % 2 ** (len(self.network.multipliers) - 1):

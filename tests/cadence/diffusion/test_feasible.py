@@ -8,8 +8,9 @@ from test_general import network
 
 from cadence.bank.bank import Bank
 from cadence.constraints.checker import segments_in_collision, states_in_collision
+from cadence.constraints.limits import KeepOut
 from cadence.constraints.obstacles import Obstacles
-from cadence.diffusion.feasible import Feasibility, GuidanceConfig, KeepOut, resampled
+from cadence.diffusion.feasible import Feasibility, GuidanceConfig, resampled
 from cadence.diffusion.general import GeneralModel
 from cadence.types import Context, Detections, WindowBatch
 

@@ -163,6 +163,26 @@ def test_nothing_is_said_of_windows_without_detections() -> None:
     assert found.status == (("no_detections",), ("ok",))
 
 
+def test_no_track_leaves_a_map_that_ends_somewhere() -> None:
+    low, high = torch.tensor([3500.0, 3500.0]).double(), torch.tensor([6500.0, 6500.0]).double()
+    cut = windows(24)
+    place = {}
+    for edge_m in (None, (3500.0, 3500.0, 6500.0, 6500.0)):
+        drawn = model(config=dataclasses.replace(CONFIG, edge_m=edge_m)).sample(cut.windows, 4).position_m[:, :, 0]
+        place[edge_m is None] = drawn + cut.context.datum_m[:, None, None]
+    seen = cut.windows.detections
+    last = seen.position_m[:, 0].gather(1, (seen.count[:, 0] - 1)[:, None, None].expand(-1, 1, 2))[:, 0].double()
+    last = last + cut.context.datum_m
+    is_on_map = ((last >= low) & (last <= high)).all(-1)
+    assert 0 < int(is_on_map.sum()) < 24
+    assert bool(((place[True] < low) | (place[True] > high)).any())
+    assert bool(((place[False] >= low) & (place[False] <= high))[is_on_map].all())
+    # who was seen beyond the edge was there: the map reaches as far
+    beyond = place[False][~is_on_map]
+    widest = torch.minimum(low, last)[~is_on_map, None, None], torch.maximum(high, last)[~is_on_map, None, None]
+    assert bool(((beyond >= widest[0] - 1e-6) & (beyond <= widest[1] + 1e-6)).all())
+
+
 @pytest.mark.parametrize("guidance", ["none", "final", "clean", "paper"])
 def test_guidance_and_repair_keep_out_of_obstacles(guidance: str) -> None:
     circles = torch.tensor([[6500.0, 5000.0, 700.0], [3500.0, 5000.0, 700.0], [5000.0, 6500.0, 700.0]], dtype=torch.float64)
