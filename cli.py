@@ -50,7 +50,7 @@ Mission = Annotated[
 Out = Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the results; made where it is absent.")]
 RunOut = Annotated[str, typer.Option("--out", metavar="DIR", help="Folder or URL for the results.")]
 Workers = Annotated[
-    int | None, typer.Option(metavar="N", help="Processes; 0 works in this one; default: as cores and memory allow.")
+    int | None, typer.Option(metavar="N", help="Cores to use, for many logs and inside each; 0: one, here; default: all.")
 ]
 Engine = Annotated[Literal["local", "ray"], typer.Option(help="Where the work is done: here, or on Ray (RAY_ADDRESS).")]
 Start = Annotated[str | None, typer.Option(metavar="T", help="Use nothing before T: extract.start.")]

@@ -47,6 +47,7 @@ FLOORS = {
             "obstacle_file",
             "score_words",
             "suspicions",
+            "threads",
         },
         {"files"},
         {"manifest", "tables"},

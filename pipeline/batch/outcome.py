@@ -24,6 +24,7 @@ class LogTask:
     parts       its log, or the parts of a split one in the order of the recording: paths or URLs
     directory   its mission directory: path or URL
     size_bytes  of all parts; 0 where unknown
+    num_threads  in which its windows are drawn; it changes no result
     """
 
     index: int
@@ -32,6 +33,7 @@ class LogTask:
     size_bytes: int
     config: "RunConfig"
     force: bool = False
+    num_threads: int = 1
 
     @property
     def log(self) -> str:

@@ -8,6 +8,7 @@ import threading
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from types import FrameType
@@ -29,6 +30,7 @@ from pipeline.manifest import manifest_path
 from pipeline.missions import CATALOGUE_NAME, REPORT_NAME
 from pipeline.progress import Doing, Progress, Told
 from pipeline.stores.urls import is_url
+from pipeline.threads import num_cores
 
 _WORKER_BYTES = 2_000_000_000
 _MEMINFO = Path("/proc/meminfo")
@@ -44,7 +46,8 @@ def run(
     """Run all stages on every mission among `logs`, each in its own mission directory under `out`; outcomes in their order.
 
     Writes `out`/batch.json, and the same to `report`; `on_unwritten` hears of one that cannot be written, so that the
-    outcomes are not lost with it (without it, that is raised). `num_workers`: processes; 0 runs in this one; None chooses.
+    outcomes are not lost with it (without it, that is raised). `num_workers`: cores to use, as processes for several logs and
+    as threads inside one; 0: this process and one thread; None chooses. It changes no byte of the results.
     Raises `UsageError` or `InputError` where there is no log at all, `DeviceError` where nothing can be written to `out`.
     """
     started_s = time.monotonic()
@@ -52,6 +55,7 @@ def run(
     tasks = plan_tasks(logs, out, config, force)
     _make_folder(out)
     chosen = choose_engine(engine, len(tasks), num_workers)
+    tasks = tuple(replace(task, num_threads=threads_each(engine, len(tasks), num_workers)) for task in tasks)
     if len(tasks) > 1:
         progress.note(_plan_line(tasks))
     for line in _renamed(tasks, out):
@@ -101,8 +105,18 @@ def choose_engine(name: EngineName, num_tasks: int, num_workers: int | None) -> 
     if name == "ray":
         return partial(run_on_ray, num_workers=num_workers or None)
     if num_workers is None:
-        num_workers = 0 if num_tasks == 1 else max(1, min(len(os.sched_getaffinity(0)), _free_bytes() // _WORKER_BYTES))
+        num_workers = 0 if num_tasks == 1 else max(1, min(num_cores(), _free_bytes() // _WORKER_BYTES))
     return partial(run_in_processes, num_workers=num_workers) if num_workers else run_in_sequence
+
+
+def threads_each(name: EngineName, num_tasks: int, num_workers: int | None) -> int:
+    """In how many threads each task draws: cores that have no task of their own (or as many more as `num_workers` says) help.
+
+    On Ray, which counts them itself, a task has one.
+    """
+    if name == "ray" or num_workers == 0:
+        return 1
+    return max(1, (num_workers or num_cores()) // max(num_tasks, 1))
 
 
 def _plan_line(tasks: Sequence[LogTask]) -> str:

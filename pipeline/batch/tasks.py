@@ -7,10 +7,8 @@ import contextlib
 import itertools
 import time
 import traceback
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from pathlib import Path
-
-import torch
 
 from cadence.errors import CadenceError, DeviceError, NothingDetectedError
 from pipeline.batch.config import RunConfig
@@ -26,6 +24,7 @@ from pipeline.missions import find_missions
 from pipeline.out_of_memory import ADVICE, is_out_of_memory
 from pipeline.progress import Progress, Told
 from pipeline.report.stage import report
+from pipeline.threads import one_thread
 
 STAGES = ("ingest", "extract", "infer", "export", "report")
 _PROGRESS = (0.0, 0.05, 0.1, 0.85, 0.95, 1.0)
@@ -61,8 +60,7 @@ def run_task(task: LogTask, progress: Progress) -> LogOutcome:
     finished: list[StageResult] = []
     message, code, trace = "", 0, ""
     try:
-        # One thread: results depend on the number of threads, and must not depend on who else is running.
-        with _threads(1), locked(Path(task.directory), progress.note):
+        with one_thread(), locked(Path(task.directory), progress.note):
             for stage, (begin, end) in zip(_RUNS, itertools.pairwise(_PROGRESS), strict=True):
                 finished.append(stage(task, progress.part(begin, end)))
     except NothingDetectedError as error:  # of a damaged log nobody knows: detections may be lost
@@ -99,16 +97,6 @@ def _naming(task: LogTask, message: str) -> str:
     return message if is_named else f"{task.parts[0]}: {message}"
 
 
-@contextlib.contextmanager
-def _threads(count: int) -> Iterator[None]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(count)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
-
-
 def _ingest(task: LogTask, progress: Progress) -> StageResult:
     parts = [Path(part) for part in task.parts]
     log = parts if len(parts) > 1 else parts[0]
@@ -120,7 +108,7 @@ def _extract(task: LogTask, progress: Progress) -> StageResult:
 
 
 def _infer(task: LogTask, progress: Progress) -> StageResult:
-    return infer(Path(task.directory), task.config.infer, progress, task.force)
+    return infer(Path(task.directory), task.config.infer, progress, task.force, task.num_threads)
 
 
 def _export(task: LogTask, progress: Progress) -> StageResult:

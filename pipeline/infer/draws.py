@@ -1,6 +1,10 @@
-"""Windows in chunks to hypotheses; where detections are of unknown origin, each is drawn under its own association."""
+"""Windows in chunks to hypotheses; where detections are of unknown origin, each is drawn under its own association.
 
-from collections.abc import Iterator
+Chunks are pieces of work that know nothing of one another: `pipeline.threads.in_order` does several at once.
+"""
+
+import functools
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import torch
@@ -16,14 +20,18 @@ _WORST_FIRST = ("guidance_diverged", "infeasible", "ok")
 
 Drawn = tuple[Tensor, Tensor, Tensor, list[list[str]]]
 """Numbers of windows [b], positions [b, K, A, T, 2] about their datum, weights [b, K], status [b][A]."""
+Piece = Callable[[], Drawn]
 
 
-def draw_windows(estimator: Estimator, windows: MissionWindows, num_hypotheses: int, is_apart: bool) -> Iterator[Drawn]:
+def draw_windows(estimator: Estimator, windows: MissionWindows, num_hypotheses: int, is_apart: bool) -> Iterator[Piece]:
     """Windows whose detections say whose they are; `is_apart`: agent by agent, so that chunks are counted in agents."""
-    batch = windows.batch
-    for part in _by_tracks(windows) if is_apart else _by_windows(batch.num_windows):
-        drawn = estimator.sample(batch[part], num_hypotheses)
-        yield part, drawn.position_m.double(), drawn.weight.double(), [list(row) for row in drawn.status]
+    for part in _by_tracks(windows) if is_apart else _by_windows(windows.batch.num_windows):
+        yield functools.partial(_draw_part, estimator, windows, num_hypotheses, part)
+
+
+def _draw_part(estimator: Estimator, windows: MissionWindows, num_hypotheses: int, part: Tensor) -> Drawn:
+    drawn = estimator.sample(windows.batch[part], num_hypotheses)
+    return part, drawn.position_m.double(), drawn.weight.double(), [list(row) for row in drawn.status]
 
 
 def _by_windows(num_windows: int) -> Iterator[Tensor]:
@@ -40,52 +48,55 @@ def _by_tracks(windows: MissionWindows) -> Iterator[Tensor]:
             yield part
 
 
-def draw_tracks(estimator: Estimator, associated: AssociatedWindows, num_hypotheses: int) -> Iterator[Drawn]:
+def draw_tracks(estimator: Estimator, associated: AssociatedWindows, num_hypotheses: int) -> Iterator[Piece]:
     """For estimators that treat agents apart: every different track of a window is drawn once, and joined by association."""
     for whole in _by_windows(associated.windows.batch.num_windows):
         begin = int(whole[0])
         windows, column = associated.tracks(slice(begin, begin + len(whole)))
-        for part, position, weight, status in draw_windows(estimator, windows, num_hypotheses, is_apart=True):
-            yield begin + part, *_joined(column[part], position, weight, status)
+        for piece in draw_windows(estimator, windows, num_hypotheses, is_apart=True):
+            yield functools.partial(_joined, begin, column, piece)
 
 
-def _joined(
-    column: Tensor, position: Tensor, weight: Tensor, status: list[list[str]]
-) -> tuple[Tensor, Tensor, list[list[str]]]:
+def _joined(begin: int, all_columns: Tensor, piece: Piece) -> Drawn:
     """Agents [b, K, A] out of tracks [b, K, U]; NaN where an agent is not part of a hypothesis."""
+    part, position, weight, status = piece()
+    column = all_columns[part]
     pick = column.clamp_min(0)[..., None, None].expand(-1, -1, -1, *position.shape[3:])
     joined = torch.where((column >= 0)[..., None, None], position.gather(2, pick), torch.nan)
     found = [
         [_worst([row[u] for u in used.unique().tolist() if u >= 0]) for used in columns.unbind(-1)]
         for row, columns in zip(status, column, strict=True)
     ]
-    return joined, weight, found
+    return begin + part, joined, weight, found
 
 
 def _worst(status: list[str]) -> str:
     return next((word for word in _WORST_FIRST if word in status), "no_detections")
 
 
-def draw_associations(estimator: Estimator, associated: AssociatedWindows, num_hypotheses: int) -> Iterator[Drawn]:
+def draw_associations(estimator: Estimator, associated: AssociatedWindows, num_hypotheses: int) -> Iterator[Piece]:
     """For estimators whose agents see each other: every association is a window, drawn as often as it has hypotheses."""
-    whole = associated.windows
-    num_agents, num_steps = len(whole.agent_ids), whole.batch.num_steps
-    for part in _by_windows(whole.batch.num_windows):
-        begin = int(part[0])
-        some, window, count = associated.by_association(slice(begin, begin + len(part)))
-        # hypotheses of a window by association: where those of each begin
-        first = np.cumsum(count) - count - num_hypotheses * (window - begin)
-        position = torch.full((len(part), num_hypotheses, num_agents, num_steps, 2), torch.nan, dtype=torch.float64)
-        weight = torch.zeros(len(part), num_hypotheses, dtype=torch.float64)
-        found: list[list[set[str]]] = [[set() for _ in range(num_agents)] for _ in part]
-        for size in np.unique(count).tolist():
-            chosen = np.flatnonzero(count == size)
-            drawn = estimator.sample(some.batch[torch.from_numpy(chosen)], size)
-            rows = torch.from_numpy(window[chosen] - begin)[:, None]
-            columns = torch.from_numpy(first[chosen])[:, None] + torch.arange(size)
-            position[rows, columns] = drawn.position_m.double()
-            weight[rows, columns] = drawn.weight.double() * size / num_hypotheses
-            for row, words in zip(rows[:, 0].tolist(), drawn.status, strict=True):
-                for agent, word in enumerate(words):
-                    found[row][agent].add(word)
-        yield part, position, weight, [[_worst(list(words)) for words in row] for row in found]
+    for part in _by_windows(associated.windows.batch.num_windows):
+        yield functools.partial(_draw_associated, estimator, associated, num_hypotheses, part)
+
+
+def _draw_associated(estimator: Estimator, associated: AssociatedWindows, num_hypotheses: int, part: Tensor) -> Drawn:
+    begin, num_agents = int(part[0]), len(associated.windows.agent_ids)
+    some, window, count = associated.by_association(slice(begin, begin + len(part)))
+    # hypotheses of a window by association: where those of each begin
+    first = np.cumsum(count) - count - num_hypotheses * (window - begin)
+    shape = (len(part), num_hypotheses, num_agents, associated.windows.batch.num_steps, 2)
+    position = torch.full(shape, torch.nan, dtype=torch.float64)
+    weight = torch.zeros(len(part), num_hypotheses, dtype=torch.float64)
+    found: list[list[set[str]]] = [[set() for _ in range(num_agents)] for _ in part]
+    for size in np.unique(count).tolist():
+        chosen = np.flatnonzero(count == size)
+        drawn = estimator.sample(some.batch[torch.from_numpy(chosen)], size)
+        rows = torch.from_numpy(window[chosen] - begin)[:, None]
+        columns = torch.from_numpy(first[chosen])[:, None] + torch.arange(size)
+        position[rows, columns] = drawn.position_m.double()
+        weight[rows, columns] = drawn.weight.double() * size / num_hypotheses
+        for row, words in zip(rows[:, 0].tolist(), drawn.status, strict=True):
+            for agent, word in enumerate(words):
+                found[row][agent].add(word)
+    return part, position, weight, [[_worst(list(words)) for words in row] for row in found]

@@ -1,6 +1,6 @@
 """Infer: detections → hypotheses: the model fitted to the log, all windows batched, constraints kept."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ from pipeline.estimators.fitting import FittingData
 from pipeline.estimators.loaded import Loaded
 from pipeline.estimators.presets import find_weights, load_estimator, refuse_unread
 from pipeline.infer.config import InferConfig
-from pipeline.infer.draws import Drawn, draw_associations, draw_tracks, draw_windows
+from pipeline.infer.draws import Drawn, Piece, draw_associations, draw_tracks, draw_windows
 from pipeline.infer.rows import hypothesis_rows, window_rows, with_association
 from pipeline.manifest import StageResult, run_stage
 from pipeline.missions import CATALOGUE_NAME
@@ -26,14 +26,18 @@ from pipeline.obstacle_file import OBSTACLES_NAME, read_obstacles
 from pipeline.progress import Progress
 from pipeline.suspicions import Suspicions
 from pipeline.tables import Frame, read_table, write_table
+from pipeline.threads import in_order, num_cores, one_thread
 from pipeline.windows import MissionWindows, build_windows
 
 
-def infer(directory: Path, config: InferConfig, progress: Progress, force: bool = False) -> StageResult:
+def infer(
+    directory: Path, config: InferConfig, progress: Progress, force: bool = False, num_threads: int | None = None
+) -> StageResult:
     """Draw hypotheses for every window of the mission in `directory`: hypotheses.parquet and windows.parquet.
 
     Where detections of unknown origin were told apart, associations.parquet and labels.parquet hold how. A checkpoint that the
-    log shows not to fit is not used but suspected; `ImplausibleInputError` where `config.is_strict`.
+    log shows not to fit is not used but suspected; `ImplausibleInputError` where `config.is_strict`. Windows are drawn in
+    `num_threads` threads, by default one a core; their number changes no byte.
     """
     weights = find_weights(config.checkpoint)
     inputs = [directory / "detections.parquet", directory / OBSTACLES_NAME]
@@ -48,7 +52,8 @@ def infer(directory: Path, config: InferConfig, progress: Progress, force: bool 
         plan = _Plan.of(config, detections, read_obstacles(inputs[1]), start_ns)
         for line in plan.suspicions.lines():
             progress.note(f"infer: suspected {line}")
-        summary = _draw(plan, str(detections["log_id"][0]), folder, frame, progress)
+        drawn = in_order(plan.draws, num_threads or num_cores())
+        summary = _draw(plan, drawn, str(detections["log_id"][0]), folder, frame, progress)
         if plan.seen.sources.association is not None:
             found = plan.seen.sources.association.rows(detections)
             write_table(found, folder / "associations.parquet", "associations", frame)
@@ -67,7 +72,8 @@ def infer(directory: Path, config: InferConfig, progress: Progress, force: bool 
 
     # the catalogue itself is no input: it names the place of the log, and a log that was moved is not inferred again
     facts = {"start_ns": start_ns}
-    return run_stage("infer", directory, config=config, inputs=inputs, body=body, force=force, facts=facts)
+    with one_thread():
+        return run_stage("infer", directory, config=config, inputs=inputs, body=body, force=force, facts=facts)
 
 
 def _hash(checkpoint: str) -> str | None:
@@ -82,11 +88,11 @@ def _mission_start_ns(directory: Path, detections: pa.Table) -> int:
     return int(pc.min(detections["time_ns"]).as_py() or 0)
 
 
-def _draw(plan: "_Plan", log_id: str, folder: Path, frame: Frame, progress: Progress) -> dict[str, Any]:
+def _draw(plan: "_Plan", draws: Iterable[Drawn], log_id: str, folder: Path, frame: Frame, progress: Progress) -> dict[str, Any]:
     """All windows into the two tables; what the summary says of them."""
     parts, statuses = [], []
     with progress.bar(plan.windows.batch.num_windows, "infer", unit="window") as bar:
-        for part, positions, weight, status in plan.draws:
+        for part, positions, weight, status in draws:
             parts.append(hypothesis_rows(log_id, plan.windows, plan.seen.sources.grid, part, positions, weight))
             rows = window_rows(plan.windows, part, positions, weight, status)
             statuses.append(rows if plan.seen.associated is None else with_association(rows, plan.seen.associated, part))
@@ -144,7 +150,7 @@ class _Plan:
 
     checkpoint: str
     seen: _Seen
-    draws: Iterator[Drawn]
+    draws: Iterator[Piece]
     about: Mapping[str, Any]
     suspicions: Suspicions
 

@@ -13,7 +13,7 @@ from cadence.errors import InputError
 from pipeline.batch.config import RunConfig
 from pipeline.batch.engines.local import run_in_processes, run_in_sequence
 from pipeline.batch.outcome import LogTask, exit_code
-from pipeline.batch.run import _Shown, choose_engine, run
+from pipeline.batch.run import _Shown, choose_engine, run, threads_each
 from pipeline.batch.tasks import run_task, run_tasks
 from pipeline.config import stage_config
 from pipeline.locks import clear_abandoned, locked
@@ -150,6 +150,21 @@ def test_one_log_needs_no_worker_and_more_have_some():
     assert choose_engine("local", 5, 0) is run_in_sequence
     chosen = choose_engine("local", 5, 3)
     assert isinstance(chosen, functools.partial) and chosen.keywords == {"num_workers": 3}
+
+
+@pytest.mark.parametrize(
+    ("engine", "num_tasks", "num_workers", "each"),
+    [
+        ("local", 1, 0, 1),
+        ("local", 1, 6, 6),
+        ("local", 2, 6, 3),
+        ("local", 9, 4, 1),
+        ("ray", 1, 8, 1),
+        ("local", 10_000, None, 1),
+    ],
+)
+def test_cores_without_a_log_of_their_own_help_inside_one(engine, num_tasks, num_workers, each):
+    assert threads_each(engine, num_tasks, num_workers) == each
 
 
 def test_a_folder_is_held_by_one_at_a_time(tmp_path):

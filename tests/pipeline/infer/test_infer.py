@@ -20,6 +20,8 @@ from pipeline.config import config_as_dict
 from pipeline.estimators.fitting import FittingData
 from pipeline.estimators.presets import load_estimator
 from pipeline.estimators.samplings import GeneralSampling, Samplings
+from pipeline.files import hash_file
+from pipeline.infer import draws
 from pipeline.infer.config import InferConfig
 from pipeline.infer.draws import draw_windows
 from pipeline.infer.stage import infer
@@ -182,12 +184,23 @@ def test_the_gate_is_in_the_summary(tmp_path: Path) -> None:
     assert about["share_future"] == 0.0 and about["future_network"] > 1.0
 
 
+def test_the_number_of_threads_changes_no_byte(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(draws, "_TRACKS_AT_ONCE", 3)
+    weights, digests = checkpoint(tmp_path), set()
+    config = dataclasses.replace(CONFIG, checkpoint=str(weights), is_gated=False)
+    for num_threads in (1, 3):
+        directory = mission(tmp_path / str(num_threads))
+        infer(directory, config, QUIET, num_threads=num_threads)
+        digests.add(tuple(hash_file(directory / name) for name in ("hypotheses.parquet", "windows.parquet")))
+    assert len(digests) == 1
+
+
 def drawn(table: pa.Table, weights: Path) -> torch.Tensor:
     loaded = load_estimator(str(weights), Samplings(general=GeneralSampling(is_gated=False)))
     grid = plan_grid(table, loaded.grid(GRID))
     windows = build_windows(table, grid, 5)
     estimator = loaded.fitted(FittingData.of(table, grid, windows)).estimator
-    parts = [positions for _, positions, _, _ in draw_windows(estimator, windows, CONFIG.num_hypotheses, loaded.is_apart)]
+    parts = [piece()[1] for piece in draw_windows(estimator, windows, CONFIG.num_hypotheses, loaded.is_apart)]
     return torch.cat(parts) + torch.from_numpy(windows.datum_m)[:, None, None, None]
 
 

@@ -116,7 +116,8 @@ def test_every_association_is_a_window_for_estimators_of_several_agents() -> Non
 
     start_ns = int(found.windows.origins_ns[1]) - 10**9
     located = found.located(start_ns, Obstacles.none())
-    ((part, position, weight, status),) = draw_associations(Counting(), located, 8)
+    (piece,) = draw_associations(Counting(), located, 8)
+    part, position, weight, status = piece()
     assert part.tolist() == [0, 1] and status == [["ok", "ok"], ["ok", "ok"]]
     torch.testing.assert_close(weight, torch.full((2, 8), 0.125, dtype=torch.float64))
     assert position[1, :, 0, 0, 0].tolist() == [1.0] * 8
