@@ -114,10 +114,12 @@ def score_cells(
     is_known: Tensor,
     inside: Tensor | None = None,
     fastest_m: float = float("inf"),
+    is_brief: bool = False,
 ) -> Cells:
     """Score one batch: truth_m [B, A, T, 2] relative to the datum, is_known [B, A, T], inside [B, K, A, T] in obstacles.
 
-    `fastest_m` is the length of a step that hardly any true one exceeds.
+    `fastest_m` is the length of a step that hardly any true one exceeds. Brief scores lack (NaN) what takes most of the time:
+    energy scores, the best hypothesis, step lengths.
 
     Cells before an agent's first detection, of agents without detections, and of agents without hypotheses are left out.
     """
@@ -129,10 +131,11 @@ def score_cells(
     value = torch.full((*chosen.shape, len(METRICS)), torch.nan, dtype=torch.float64)
     rows, agents, steps = chosen.nonzero(as_tuple=True)
     at = found.position_m.double()[rows, :, agents, steps][:, :, None, None]  # [C, K, 1, 1, 2]
-    value[chosen] = _cell_values(at, weight[rows, :, agents], truth_m[chosen][:, None, None])
-    for side in (~is_future, is_future):
-        _put_track_values(value, found.position_m, weight, truth_m, chosen & side)
-    _put_step_lengths(value, found.position_m, weight, truth_m, chosen)
+    value[chosen] = _cell_values(at, weight[rows, :, agents], truth_m[chosen][:, None, None], is_brief)
+    if not is_brief:
+        for side in (~is_future, is_future):
+            _put_track_values(value, found.position_m, weight, truth_m, chosen & side)
+        _put_step_lengths(value, found.position_m, weight, truth_m, chosen)
     if math.isfinite(fastest_m):
         for side in (~is_future, is_future):
             _put_fast_steps(value, found.position_m, weight, chosen & side, fastest_m)
@@ -153,6 +156,7 @@ def score_in_chunks(
     is_inside: IsInside | None = None,
     after_chunk: Callable[[int], object] | None = None,
     fastest_m: float = float("inf"),
+    is_brief: bool = False,
 ) -> Cells:
     """`score_cells` for any number of windows in bounded memory; windows without any cell to score are not drawn."""
     states = windows.num_agents * num_hypotheses * windows.num_steps
@@ -161,7 +165,7 @@ def score_in_chunks(
     for index in torch.split(asked, max(1, _MAX_STATES // states)):
         found = draw(index)
         inside = None if is_inside is None else is_inside(found.position_m, index)
-        part = score_cells(found, windows[index], truth_m[index], is_known[index], inside, fastest_m)
+        part = score_cells(found, windows[index], truth_m[index], is_known[index], inside, fastest_m, is_brief)
         parts.append(replace(part, window=index.numpy().astype(np.int32)[part.window]))
         if after_chunk is not None:
             after_chunk(len(index))
@@ -219,6 +223,12 @@ def summarise(name: str, cells: Cells, groups: Int64s, seed: int = 0, num_resamp
     return [row for row in rows if row.num_cells]
 
 
+def part_mean(cells: Cells, part: str, metric: str) -> float:
+    """The value that `summarise` gives for a part, without its interval; NaN without any cell."""
+    values = cells.column(metric)[cells.is_in(part)]
+    return metrics.bootstrap_mean(values, np.zeros(len(values)), np.random.default_rng(0), 1).value
+
+
 def energy_ratio(
     cells: Cells, rival: Cells, part: str, groups: Int64s, seed: int = 0, num_resamples: int = 2000
 ) -> metrics.Interval:
@@ -251,13 +261,13 @@ def _filled_up(found: HypothesisSet) -> tuple[HypothesisSet, Tensor]:
     return replace(found, position_m=torch.where(is_there[..., None, None], found.position_m, one)), weight
 
 
-def _cell_values(at: Tensor, weight: Tensor, truth_m: Tensor) -> Tensor:
+def _cell_values(at: Tensor, weight: Tensor, truth_m: Tensor, is_brief: bool) -> Tensor:
     """What one cell tells by itself: at [C, K, 1, 1, 2], weight [C, K], truth_m [C, 1, 1, 2] -> [C, len(METRICS)]."""
     value = torch.full((len(at), len(METRICS)), torch.nan, dtype=torch.float64)
     if not len(at):
         return value
     distance = metrics.expected_distance(at, weight, truth_m).flatten()
-    plain = metrics.energy_score(at, weight, truth_m).flatten()
+    plain = torch.full_like(distance, torch.nan) if is_brief else metrics.energy_score(at, weight, truth_m).flatten()
     covered = metrics.coverage(at, weight, truth_m, (0.5, 0.9)).reshape(2, -1)
     columns = {
         "ade_m": distance,
