@@ -1,5 +1,6 @@
 """What the names in tables of scores mean, in words for people."""
 
+import math
 from collections.abc import Mapping
 from typing import Final
 
@@ -24,6 +25,12 @@ mean distance of one hypothesis, and the share of the truth that lies in the reg
 def estimator_words(name: str) -> str:
     """What an estimator is called in a table."""
     return ESTIMATORS.get(name, name)
+
+
+def coverage_words(held: float) -> str:
+    """What a region of 90 % is worth that holds this share of the truth."""
+    limits = ((0.5, "do not believe it"), (0.83, "it is too narrow"), (0.96, "as it should"), (math.inf, "it is too wide"))
+    return next(words for limit, words in limits if held <= limit)
 
 
 def value_words(metric: str, value: float | None) -> str:

@@ -12,7 +12,7 @@ import numpy as np
 from cadence.arrays import Int64s
 from pipeline.evaluate.joint import JOINT_METRICS, JointCells, block_of, summarise_joint
 from pipeline.plain_rows import rows_as_csv, without_nan
-from pipeline.score_words import estimator_words
+from pipeline.score_words import coverage_words, estimator_words
 from pipeline.scoring.motion import MotionLaws, MotionSample, motion_rows
 from pipeline.scoring.scores import PARTS, Cells, ScoreRow, energy_ratio, groups_of, summarise
 
@@ -206,9 +206,7 @@ def _verdict(report: ScoreReport, part: str) -> list[str]:
         is_certain = best.high < 1 or best.low > 1
         sentences.append(f"the energy score is {apart}{'' if is_certain else ', which may be chance'};")
     if held is not None and math.isfinite(held):
-        limits = ((0.5, "do not believe it"), (0.83, "it is too narrow"), (0.96, "as it should"), (math.inf, "it is too wide"))
-        judged = next(words for limit, words in limits if held <= limit)
-        sentences.append(f"the 90 % region holds {100 * held:.0f} % of the truth: {judged}.")
+        sentences.append(f"the 90 % region holds {100 * held:.0f} % of the truth: {coverage_words(held)}.")
     return sentences
 
 

@@ -1,159 +1,79 @@
-"""Numbers and choices of the page: envelopes, spread, errors against truth, moments worth a picture, runs of bad windows.
+"""Numbers and choices of the page: spread, speeds, errors, moments worth a picture, runs of bad windows."""
 
-Letters of the shapes: K hypothesis, T time step, D space (2).
-"""
-
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import groupby
 
 import numpy as np
 
-from cadence.arrays import Bools, Float64s, Int64s
-from pipeline.report.mission import Fan, Mission, Points, WindowRow
-from pipeline.tracks import interpolated
+from cadence.arrays import Float64s
+from pipeline.report.mission import LIKELY, Fan, Mission, WindowRow
+from pipeline.report.scored import Scored, errors_now
+from pipeline.report.shapes import spread_at
 
-LEVELS = (0.5, 0.9)
-"""Shares of the weight that the two envelopes hold."""
-
-SMALL_M2 = 1e-6
-"""Added to variances (1 mm²): exact detections leave no spread, and a point must still have an inside."""
-
-_GAP_FACTOR = 3.0
-"""Truth is not interpolated in gaps of over so many times its median interval."""
+_ROUNDING = 1e-3
+"""Tracks are stored as float32: a speed that is over a limit by less than this share keeps it."""
 
 
 @dataclass(frozen=True, eq=False)
-class FanShape:
-    """The hypotheses of one agent in one window, summed up at every step.
+class Speeds:
+    """How fast the tracks are, a track being one hypothesis of one agent in one window.
 
-    mean_m [T, 2] weighted mean; axes_m [T, 2] and angle_rad [T]: standard deviations along the principal axes and the
-    direction of the first; radius [2, T]: how many of them the envelopes of `LEVELS` reach
+    limit_mps  that none should exceed: stated by the user, or else plausible by the log's own detections; None where neither is
+    known. num_over of num_tracks have a segment that exceeds it; fastest_mps is the fastest segment of all.
     """
 
-    mean_m: Float64s
-    axes_m: Float64s
-    angle_rad: Float64s
-    radius: Float64s
-
-    @property
-    def spread_m(self) -> Float64s:
-        """Root mean square distance to the mean [T]."""
-        return np.asarray(np.hypot(self.axes_m[:, 0], self.axes_m[:, 1]))
-
-
-def shape_of(fan: Fan) -> FanShape:
-    """Weighted mean, principal axes and the empirical envelopes of a fan.
-
-    An envelope is, at every step, the smallest ellipse with the axes of the weighted covariance that holds the share of
-    the weight.
-    """
-    offset_m = fan.offset_m.astype(np.float64)
-    mean_m = np.einsum("k,ktd->td", fan.weight, offset_m)
-    centred = offset_m - mean_m
-    covariance = np.einsum("k,ktd,kte->tde", fan.weight, centred, centred)
-    variance, axes = np.linalg.eigh(covariance)
-    variance = np.maximum(variance, 0.0)
-    along = np.einsum("ktd,tde->kte", centred, axes)
-    distance = np.sqrt((along**2 / (variance + SMALL_M2)).sum(axis=-1))
-    order = np.argsort(distance, axis=0, kind="stable")
-    held = np.cumsum(fan.weight[order], axis=0)
-    # The first hypothesis at which the share is reached; the small number forgives the rounding of the sum.
-    radius = [
-        np.take_along_axis(np.take_along_axis(distance, order, 0), (held >= level - 1e-9).argmax(0)[None], 0)[0]
-        for level in LEVELS
-    ]
-    major = axes[:, :, 1]
-    return FanShape(mean_m + fan.datum_m, np.sqrt(variance[:, ::-1]), np.arctan2(major[:, 1], major[:, 0]), np.stack(radius))
-
-
-@dataclass(frozen=True)
-class TruthScore:
-    """Quick figures against truth over the steps of the past or of the future."""
-
-    num_steps: int
-    mean_error_m: float
-    median_error_m: float
-    coverage: float
-
-
-def interpolate_truth(truth: Points, time_ns: Int64s) -> Float64s:
-    """Truth of one agent at `time_ns` [T, 2]; NaN outside it, inside wide gaps, and where there is but one point."""
-    if len(truth) < 2:
-        return np.full((len(time_ns), 2), np.nan)
-    return interpolated(truth.time_ns, truth.position_m, time_ns, _GAP_FACTOR * float(np.median(np.diff(truth.time_ns))))
-
-
-def truth_errors(fan: Fan, shape: FanShape, truth: Points) -> tuple[Float64s, Bools]:
-    """Distance from the mean to truth [T] (NaN where truth is silent) and whether the 90 % envelope holds truth [T]."""
-    difference = interpolate_truth(truth, fan.time_ns) - shape.mean_m
-    turn = np.stack([np.cos(shape.angle_rad), np.sin(shape.angle_rad)])
-    along = difference[:, 0] * turn[0] + difference[:, 1] * turn[1]
-    across = difference[:, 1] * turn[0] - difference[:, 0] * turn[1]
-    distance = np.sqrt(along**2 / (shape.axes_m[:, 0] ** 2 + SMALL_M2) + across**2 / (shape.axes_m[:, 1] ** 2 + SMALL_M2))
-    return np.hypot(along, across), distance <= shape.radius[1]
+    limit_mps: float | None
+    is_stated: bool
+    num_tracks: int
+    num_over: int
+    fastest_mps: float
 
 
 @dataclass(frozen=True, eq=False)
 class Analysis:
     """What was computed over all fans.
 
-    By position in `Mission.fans`: spread_now_m at the origin, spread_end_m at the last step, error_now_m of the mean at
-    the origin (NaN where truth is silent). past, future: scores against truth, None without any.
+    By position in `Mission.fans`: spread_now_m at the window's moment, spread_end_m at the last step, error_now_m mean distance
+    of a hypothesis from the truth at the moment (NaN where the truth is silent). scored: against the truth, or why not.
     """
 
     spread_now_m: Float64s
     spread_end_m: Float64s
     error_now_m: Float64s
-    past: TruthScore | None
-    future: TruthScore | None
+    speeds: Speeds
+    scored: Scored | str
 
 
-class Analyser:
-    """Collects the numbers of one fan after the other, so that shapes need not all be kept."""
+def analyse(mission: Mission, scored: Scored | str, after_fan: Callable[[int], object]) -> Analysis:
+    """The numbers over all fans; `after_fan` is called for each."""
+    errors = errors_now(scored)
+    true_agent = {} if isinstance(scored, str) else scored.true_agent
+    spread_m, error_m, fastest_mps = np.zeros((len(mission.fans), 2)), np.full(len(mission.fans), np.nan), []
+    for index, fan in enumerate(mission.fans):
+        spread_m[index] = spread_at(fan, [fan.origin_index, -1])
+        key = fan.window, mission.agents[fan.agent]
+        error_m[index] = errors.get((fan.window, true_agent.get(key, "")), np.nan)
+        fastest_mps.append(_fastest_mps(fan))
+        after_fan(1)
+    joined = np.concatenate(fastest_mps) if fastest_mps else np.zeros(0)
+    return Analysis(spread_m[:, 0], spread_m[:, 1], error_m, _speeds(mission, joined), scored)
 
-    def __init__(self, mission: Mission) -> None:
-        self._truth = {agent: mission.truth.of(agent) for agent in range(len(mission.agents))} if mission.truth else {}
-        self._detected_ns = [mission.detections.of(agent).time_ns for agent in range(len(mission.agents))]
-        self._now: list[float] = []
-        self._end: list[float] = []
-        self._error: list[float] = []
-        self._errors: tuple[list[Float64s], list[Float64s]] = ([], [])
-        self._inside: tuple[list[Bools], list[Bools]] = ([], [])
 
-    def add(self, fan: Fan, shape: FanShape) -> None:
-        """Count one fan."""
-        spread_m = shape.spread_m
-        self._now.append(float(spread_m[fan.origin_index]))
-        self._end.append(float(spread_m[-1]))
-        error = float("nan")
-        if fan.agent in self._truth and len(self._truth[fan.agent]) > 1:
-            errors, inside = truth_errors(fan, shape, self._truth[fan.agent])
-            errors[fan.time_ns < self._first_ns(fan)] = np.nan
-            error = float(errors[fan.origin_index])
-            for side, part in enumerate((slice(None, fan.origin_index + 1), slice(fan.origin_index + 1, None))):
-                known = np.isfinite(errors[part])
-                self._errors[side].append(errors[part][known])
-                self._inside[side].append(inside[part][known])
-        self._error.append(error)
+def _fastest_mps(fan: Fan) -> Float64s:
+    """Speed of the fastest segment of each hypothesis [K]."""
+    step = np.diff(fan.offset_m, axis=1)
+    length_m: Float64s = np.sqrt((step**2).sum(axis=-1).max(axis=1, initial=0.0)).astype(np.float64)
+    return length_m / (fan.step_ns / 1e9)
 
-    def _first_ns(self, fan: Fan) -> int:
-        """The first detection in the window: as in evaluate, steps before it are not compared."""
-        time_ns = self._detected_ns[fan.agent]
-        place = int(np.searchsorted(time_ns, fan.time_ns[0]))
-        return int(time_ns[place]) if place < len(time_ns) else int(fan.origin_ns)
 
-    def result(self) -> Analysis:
-        """The numbers so far."""
-        scores = []
-        for errors, inside in zip(self._errors, self._inside, strict=True):
-            joined = np.concatenate(errors) if errors else np.empty(0)
-            held = np.concatenate(inside) if inside else np.empty(0)
-            scores.append(
-                TruthScore(len(joined), float(joined.mean()), float(np.median(joined)), float(held.mean()))
-                if len(joined)
-                else None
-            )
-        return Analysis(np.array(self._now), np.array(self._end), np.array(self._error), scores[0], scores[1])
+def _speeds(mission: Mission, fastest_mps: Float64s) -> Speeds:
+    infer = mission.manifests.get("infer", {})
+    config, summary = infer.get("config") or {}, infer.get("summary") or {}
+    stated = (config.get("guidance") or {}).get("max_speed_mps")
+    limit = stated if stated is not None else summary.get("plausible_speed_mps")
+    over = 0 if limit is None else int((fastest_mps > limit * (1 + _ROUNDING)).sum())
+    return Speeds(limit, stated is not None, len(fastest_mps), over, float(fastest_mps.max(initial=0.0)))
 
 
 @dataclass(frozen=True)
@@ -170,21 +90,23 @@ def choose_moments(mission: Mission, analysis: Analysis, count: int) -> tuple[Mo
     if not fans:
         return ()
     row_of = {(row.window, row.agent): row for row in mission.rows}
-    ages = np.array([_age(row_of.get((fan.window, fan.agent))) for fan in fans])
+    rows = [row_of.get((fan.window, fan.agent)) for fan in fans]
+    is_there = np.array([row is None or row.probability is None or row.probability >= LIKELY for row in rows])
+    is_there |= not is_there.any()
+    ages, error_m = np.array([_age(row) for row in rows]), analysis.error_now_m
+    now_m, end_m = (np.where(is_there, spread_m, np.nan) for spread_m in (analysis.spread_now_m, analysis.spread_end_m))
     origins = np.array([fan.origin_ns for fan in fans])
-    # Windows before an agent's second detection are wide for want of data, which says nothing about the mission.
-    is_seen = np.array([_detections(row_of.get((fan.window, fan.agent))) > 1 for fan in fans])
-    now = np.where(is_seen | ~is_seen.any(), analysis.spread_now_m, np.nan)
-    end = np.where(is_seen | ~is_seen.any(), analysis.spread_end_m, np.nan)
+    known = int((np.isfinite(error_m) & is_there).sum())
+    of = f" (of the {known:,} of {int(is_there.sum()):,} windows and agents whose truth is known at the moment)"
     wanted = [
-        ("widest at the origin", _largest(now)),
-        ("longest without a detection", _largest(ages)),
-        ("largest error of the mean at the origin", _largest(analysis.error_now_m)),
-        ("typical spread", int(np.argsort(analysis.spread_now_m, kind="stable")[len(fans) // 2])),
-        ("widest future", _largest(end)),
-        ("last window", _largest(np.where(origins == origins.max(), np.nan_to_num(analysis.spread_now_m), np.nan))),
-        ("first window", _largest(np.where(origins == origins.min(), np.nan_to_num(analysis.spread_now_m), np.nan))),
-        ("narrowest at the origin", int(np.argmin(analysis.spread_now_m))),
+        ("widest at its moment", _largest(now_m)),
+        ("longest without a detection", _largest(np.where(is_there, ages, np.nan))),
+        (f"furthest from the truth{of if known < is_there.sum() else ''}", _largest(np.where(is_there, error_m, np.nan))),
+        ("typical spread", int(np.argsort(now_m, kind="stable")[is_there.sum() // 2])),
+        ("widest future", _largest(end_m)),
+        ("last window", _largest(np.where(origins == origins.max(), now_m, np.nan))),
+        ("first window", _largest(np.where(origins == origins.min(), now_m, np.nan))),
+        ("narrowest at its moment", _largest(-now_m)),
     ]
     reasons: dict[int, list[str]] = {}
     for reason, fan in wanted:
@@ -196,10 +118,6 @@ def choose_moments(mission: Mission, analysis: Analysis, count: int) -> tuple[Mo
 
 def _age(row: WindowRow | None) -> float:
     return row.age_s if row is not None and row.age_s is not None else float("nan")
-
-
-def _detections(row: WindowRow | None) -> int:
-    return row.num_detections if row is not None else 0
 
 
 def _largest(values: Float64s) -> int | None:

@@ -1,19 +1,22 @@
 """Fans as the page holds them: how finely, and as integers relative to a centre each."""
 
-import itertools
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
 from cadence.arrays import Float32s, Float64s, Indices
-from pipeline.report.analysis import FanShape
 from pipeline.report.mission import Fan, Mission
+from pipeline.report.modes import DIRECTIONS, Strand
 
 QUANTA = 32_000
 """Integers either side of a fan's centre; int16 holds them."""
 
 FAN_OVERHEAD_BYTES = 64
+STRAND_BYTES = 14
+STRANDS_A_VERTEX = 2
+"""Bands of hypotheses that go several ways stand side by side at their steps; two are room enough."""
 BASE64_GROWTH = 4 / 3
 
 
@@ -28,7 +31,8 @@ class Detail:
 
     def num_bytes(self, fans_per_window_and_agent: float) -> float:
         """Size of the encoded fans in the page."""
-        fan = FAN_OVERHEAD_BYTES + 4 * self.num_hypotheses + self.num_vertices * (2 + 12 + 4 * self.num_hypotheses)
+        vertex = 2 + 12 * STRANDS_A_VERTEX + 4 * self.num_hypotheses
+        fan = FAN_OVERHEAD_BYTES + 4 * STRAND_BYTES + 4 * self.num_hypotheses + self.num_vertices * vertex
         return self.num_windows * self.num_agents * fans_per_window_and_agent * fan * BASE64_GROWTH
 
 
@@ -57,42 +61,37 @@ def choose_detail(mission: Mission, budget_bytes: float, wanted: Detail) -> Deta
     return replace(detail, num_agents=max(1, min(wanted.num_agents, int(budget_bytes / an_agent))))
 
 
-def choose_vertices(track_m: Float64s, origin_index: int, count: int) -> Indices:
-    """At most `count` steps of [K, T, 2] tracks which together follow all of them best, ends and origin included.
+def choose_vertices(track_m: Float64s, wanted: Iterable[int], count: int) -> Indices:
+    """Steps of [K, T, 2] tracks by which straight lines follow all of them: the ends, those `wanted`, and more up to `count`.
 
-    Greedy: the step farthest from the chords between its chosen neighbours, over all hypotheses, joins next.
+    They are the denser the more the tracks bend: a chord is off by its length squared times the second difference.
     """
     num_steps = track_m.shape[1]
     if num_steps <= count:
         return np.arange(num_steps)
-    chosen = sorted({0, min(max(origin_index, 0), num_steps - 1), num_steps - 1})
-    deviation = np.zeros(num_steps)
-    for first, last in itertools.pairwise(chosen):
-        _measure(track_m, first, last, deviation)
-    while len(chosen) < count:
-        step = int(deviation.argmax())
-        if deviation[step] <= 0:
-            step = next(step for step in range(num_steps) if step not in chosen)
-        place = int(np.searchsorted(chosen, step))
-        chosen.insert(place, step)
-        _measure(track_m, chosen[place - 1], step, deviation)
-        _measure(track_m, step, chosen[place + 1], deviation)
-    return np.array(chosen)
-
-
-def _measure(track_m: Float64s, first: int, last: int, deviation: Float64s) -> None:
-    deviation[[first, last]] = 0.0
-    if last - first < 2:
-        return
-    share = (np.arange(first + 1, last) - first)[:, None] / (last - first)
-    chord = track_m[:, first, None] + share * (track_m[:, last] - track_m[:, first])[:, None]
-    away = track_m[:, first + 1 : last] - chord
-    deviation[first + 1 : last] = np.hypot(away[..., 0], away[..., 1]).max(axis=0)
+    bend = np.diff(track_m, n=2, axis=1)
+    density = np.zeros(num_steps)
+    density[1:-1] = np.sqrt(np.hypot(bend[..., 0], bend[..., 1]).max(axis=0))
+    density += density.mean() / 4 + 1e-9
+    chosen = {0, *wanted, num_steps - 1}
+    room = max(count - len(chosen), 0)
+    total = np.cumsum(density)
+    chosen |= set(np.searchsorted(total, (np.arange(room) + 0.5) / max(room, 1) * total[-1]).tolist())
+    for step in np.argsort(-density, kind="stable").tolist():
+        if len(chosen) >= count:
+            break
+        chosen.add(step)
+    return np.array(sorted(chosen))
 
 
 @dataclass(frozen=True, eq=False)
 class FanCode:
-    """One fan as the page holds it: header numbers, steps of its vertices, weights and quantised positions."""
+    """One fan as the page holds it: header numbers, steps of its vertices [V], weights [K] and quantised positions [K, V, 2].
+
+    strand   [R, 6] of each: first and last vertex, drawn hypothesis (-1: the mean), share in per mille, vertex where the ways
+             are furthest apart (-1: one way), direction there (index of `DIRECTIONS`)
+    summary  for each strand and vertex of it [6]: mean, axes of the 90 % band, their angle, 50 % band / 90 % band
+    """
 
     window: int
     agent: int
@@ -101,31 +100,54 @@ class FanCode:
     step: npt.NDArray[np.int16]
     weight: Float32s
     hypothesis: npt.NDArray[np.int16]
+    strand: npt.NDArray[np.int16]
     summary: npt.NDArray[np.int16]
 
 
-def encode_fan(fan: Fan, shape: FanShape, detail: Detail) -> FanCode:
-    """The heaviest hypotheses and the envelopes of a fan, [K, S, 2] and [S, 6] (mean, 90 % axes, angle, 50 % / 90 %)."""
-    heaviest = np.sort(np.argsort(-fan.weight, kind="stable")[: detail.num_hypotheses])
-    track_m = fan.offset_m[heaviest].astype(np.float64)
-    step = choose_vertices(track_m, fan.origin_index, detail.num_vertices)
-    mean_m = shape.mean_m[step]
-    reach_m = shape.axes_m[step] * shape.radius[1][step, None]
+def encode_fan(fan: Fan, strands: Sequence[Strand], detail: Detail) -> FanCode:
+    """The heaviest hypotheses of a fan, those that stand for a way, and the bands."""
+    drawn = {strand.hypothesis for strand in strands} - {None}
+    heaviest = np.argsort(-fan.weight, kind="stable")[: detail.num_hypotheses]
+    shown = np.array(sorted({*heaviest.tolist(), *drawn}))
+    track_m = fan.offset_m[shown].astype(np.float64)
+    now = min(max(fan.origin_index, 0), track_m.shape[1] - 1)
+    bounds = {step for strand in strands for step in (strand.first, strand.last, strand.apart) if step >= 0}
+    step = choose_vertices(track_m, {now, *bounds}, detail.num_vertices)
     position_m = track_m[:, step] + fan.datum_m
+    inner = [step[(step >= strand.first) & (step <= strand.last)] - strand.first for strand in strands]
+    mean_m = np.concatenate([strand.shape.mean_m[at] for strand, at in zip(strands, inner, strict=True)])
+    reach_m = np.concatenate(
+        [strand.shape.axes_m[at] * strand.shape.radius[1][at, None] for strand, at in zip(strands, inner, strict=True)]
+    )
     low = np.minimum(position_m.min(axis=(0, 1)), mean_m.min(axis=0))
     high = np.maximum(position_m.max(axis=(0, 1)), mean_m.max(axis=0))
     centre_m = (low + high) / 2
     scale_m = max(float((high - low).max()) / 2, float(reach_m.max()), 1e-3) / QUANTA
-    inner = np.divide(shape.radius[0][step], shape.radius[1][step], out=np.ones(len(step)), where=shape.radius[1][step] > 0)
-    angle = np.mod(shape.angle_rad[step] + np.pi / 2, np.pi) - np.pi / 2
-    summary = np.column_stack([(mean_m - centre_m) / scale_m, reach_m / scale_m, angle * 10_000, inner * 10_000])
+    turn = np.concatenate([_turn(strand, at) for strand, at in zip(strands, inner, strict=True)])
     return FanCode(
         fan.window,
         fan.agent,
         centre_m,
         scale_m,
         step.astype(np.int16),
-        fan.weight[heaviest].astype(np.float32),
+        fan.weight[shown].astype(np.float32),
         np.rint((position_m - centre_m) / scale_m).astype(np.int16),
-        np.rint(summary).astype(np.int16),
+        np.array([_strand_code(strand, step, shown) for strand in strands], dtype=np.int16),
+        np.rint(np.column_stack([(mean_m - centre_m) / scale_m, reach_m / scale_m, turn])).astype(np.int16),
     )
+
+
+def _turn(strand: Strand, at: Indices) -> Float64s:
+    """Angle of the bands, and the 50 % band over the 90 % band, in ten-thousandths [S, 2]."""
+    half, most = strand.shape.radius[:, at]
+    inner = np.divide(half, most, out=np.ones(len(at)), where=most > 0)
+    angle = np.mod(strand.shape.angle_rad[at] + np.pi / 2, np.pi) - np.pi / 2
+    return np.column_stack([angle * 10_000, inner * 10_000])
+
+
+def _strand_code(strand: Strand, step: Indices, shown: Indices) -> list[int]:
+    first, last = np.searchsorted(step, [strand.first, strand.last])
+    hypothesis = -1 if strand.hypothesis is None else int(np.searchsorted(shown, strand.hypothesis))
+    apart = -1 if strand.apart < 0 else int(np.searchsorted(step, strand.apart))
+    direction = DIRECTIONS.index(strand.direction) if strand.direction else -1
+    return [int(first), int(last), hypothesis, round(1000 * strand.share), apart, direction]

@@ -18,6 +18,20 @@ FACTS = {
 }
 """Facts of the catalogue's health in words."""
 
+EXTRACTED = {
+    "num_agents": "agents named",
+    "num_detections": "detections",
+    "sources.detections": "detections from",
+    "num_unknown_origin": "detections without a named agent",
+    "num_truth": "positions of the truth",
+    "sources.truth": "truth from",
+    "num_poses": "positions of sensors",
+    "sources.poses": "sensors from",
+    "num_obstacles": "obstacles",
+    "span_s": "from the first to the last detection (s)",
+}
+"""What extract found, in words."""
+
 LEFT_OUT = {
     "collapsed": "simultaneous detections merged into others",
     "disagreeing": "simultaneous detections that do not agree with the most accurate one, left out",
@@ -62,8 +76,12 @@ def _extraction(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
     unused = summary.get("unused") or {}
     rows += [("may hold detections, not used", text(f"{channel}: {why}")) for channel, why in unused.items()]
     # Other parts of the page tell of these already.
-    known = {*LEFT_OUT, "lost_spans_ns", "is_complete", "frame", "suspicions", "unused", "scatter_sigma_m"}
-    return [(label(key), text(value)) for key, value in flatten(summary)[:MAX_ENTRIES] if key.split(".")[0] not in known] + rows
+    known = {*LEFT_OUT, "lost_spans_ns", "is_complete", "frame", "suspicions", "unused", "scatter_sigma_m", *EXTRACTED}
+    flat = dict(flatten(summary))
+    found = [(text(words), text(flat[key])) for key, words in EXTRACTED.items() if flat.get(key)]
+    # What else was counted is told where there was any.
+    others = [(label(key), text(value)) for key, value in flat.items() if value and not {key, key.split(".")[0]} & known]
+    return found + others[:MAX_ENTRIES] + rows
 
 
 def _verdict(health: Health) -> str:

@@ -10,9 +10,11 @@ def nice_length(length: float) -> float:
 
 
 def metres(length_m: float) -> str:
-    """A length for people: three digits, in km from 1000 m on."""
+    """A length for people: three digits, in km from 1000 m on; nobody cares for millimetres."""
     if not math.isfinite(length_m):
         return "unknown"
+    if abs(length_m) < 0.01:
+        return "under 1 cm"
     return (
         f"{length_m / 1000:,.3g} km"
         if 999.5 <= length_m < 999_500
@@ -20,3 +22,8 @@ def metres(length_m: float) -> str:
         if length_m >= 999_500
         else f"{length_m:.3g} m"
     )
+
+
+def speed(speed_mps: float) -> str:
+    """A speed for people: three digits."""
+    return f"{speed_mps:,.0f} m/s" if speed_mps >= 100 else f"{speed_mps:.3g} m/s"

@@ -4,14 +4,15 @@ Colours come from the style sheet's classes (see `page.css`), so that they follo
 """
 
 import math
+from collections.abc import Sequence
 from html import escape
 
 import numpy as np
 
 from cadence.arrays import Float64s
-from pipeline.report.analysis import FanShape
 from pipeline.report.lengths import metres, nice_length
-from pipeline.report.mission import Fan, Mission, Obstacle
+from pipeline.report.mission import Fan, Mission, Obstacle, Points
+from pipeline.report.modes import Strand
 
 MAP_WIDTH, MAP_HEIGHT = 400, 300
 MAX_STATIC_HYPOTHESES = 40
@@ -32,32 +33,59 @@ class View:
         return np.asarray(shifted * (1, -1) + (MAP_WIDTH / 2, MAP_HEIGHT / 2))
 
 
-def moment_map(mission: Mission, fan: Fan, shape: FanShape, steps: tuple[int, int], label: str) -> str:
+def moment_map(
+    mission: Mission, fan: Fan, strands: Sequence[Strand], truth: Points | None, steps: tuple[int, int], label: str
+) -> str:
     """The map of one fan from the first to the last of `steps`.
 
-    Obstacles, truth, hypotheses, mean, detections and the place of the mean at the origin.
+    Obstacles, truth, hypotheses, detections, and where they are at the moment: their mean, or each way with its share.
     """
     shown, now = slice(steps[0], steps[1] + 1), fan.origin_index - steps[0]
     first_ns, last_ns = int(fan.time_ns[steps[0]]), int(fan.time_ns[steps[1]])
     detections = mission.detections.of(fan.agent).between(first_ns, last_ns)
     track_m = fan.offset_m[:, shown].astype(np.float64) + fan.datum_m
-    mean_m = shape.mean_m[shown]
+    lines = [(strand, *_between(strand, *steps)) for strand in strands if _between(strand, *steps)[1].size]
     # A few stray hypotheses must not shrink all others to a dot; they are cut at the border.
     low, high = np.percentile(track_m, [4, 96], axis=(0, 1))
-    view = View(np.concatenate([low[None], high[None], mean_m, detections.position_m]))
+    view = View(np.concatenate([low[None], high[None], *(line_m for _, _, line_m in lines), detections.position_m]))
     parts = [_obstacle(item, view) for item in mission.obstacles]
-    if mission.truth is not None:
-        truth = mission.truth.of(fan.agent).between(first_ns, last_ns)
-        parts.append(_line(view.pixels(truth.position_m), "truth"))
+    if truth is not None:
+        parts.append(_line(view.pixels(truth.between(first_ns, last_ns).position_m), "truth"))
     parts += _hypotheses(view.pixels(track_m), fan.weight, now)
-    mean = view.pixels(mean_m)
-    parts += [_line(mean[: now + 1], "past mean"), _line(mean[now:], "future mean")]
+    for _, first, line_m in lines:
+        line, split = view.pixels(line_m), fan.origin_index - first
+        parts += [_line(line[: max(split, 0) + 1], "past mean"), _line(line[max(split, 0) :], "future mean")]
     age = (fan.origin_ns - detections.time_ns) / max(fan.origin_ns - first_ns, 1)
     parts += _dots(view.pixels(detections.position_m), age)
-    parts.append(f'<circle class="now" cx="{mean[now][0]:.1f}" cy="{mean[now][1]:.1f}" r="6"/>')
+    parts += [f'<circle class="now" cx="{x:.1f}" cy="{y:.1f}" r="6"/>' for x, y in _now(lines, fan.origin_index, view)]
+    parts += [_share(strand, first, view.pixels(line_m)) for strand, first, line_m in lines]
     parts += [scale_bar(view.pixel_per_m), NORTH_ARROW]
     opening = f'<svg class="map" viewBox="0 0 {MAP_WIDTH} {MAP_HEIGHT}" role="img" aria-label="{escape(label)}">'
     return f"{opening}{''.join(parts)}</svg>"
+
+
+def _between(strand: Strand, first: int, last: int) -> tuple[int, Float64s]:
+    """The part of a strand's line within the steps: the step where it begins, and the line [S, 2]."""
+    begin = max(strand.first, first)
+    return begin, strand.line_m[begin - strand.first : max(last + 1 - strand.first, 0)]
+
+
+def _now(lines: Sequence[tuple[Strand, int, Float64s]], now: int, view: View) -> list[Float64s]:
+    """Where the agent is at the moment: a place for each way."""
+    there = [(strand, line_m[now - first]) for strand, first, line_m in lines if first <= now < first + len(line_m)]
+    ways = [place_m for strand, place_m in there if strand.hypothesis is not None]
+    return [view.pixels(place_m) for place_m in ways or [place_m for _, place_m in there]]
+
+
+def _share(strand: Strand, first: int, line: Float64s) -> str:
+    """How many of the hypotheses go this way, where the ways are furthest apart."""
+    if strand.share == 1.0 or not first <= strand.apart < first + len(line):
+        return ""
+    x, y = np.clip(line[strand.apart - first] + (6, -4), (4, 14), (MAP_WIDTH - 4, MAP_HEIGHT - 30))
+    is_right = x > MAP_WIDTH - 110
+    x, anchor = (min(x - 12, MAP_WIDTH - 36), "end") if is_right else (x, "start")
+    words = f"{100 * strand.share:.0f} % {strand.direction}"
+    return f'<text class="share" x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}">{words}</text>'
 
 
 def _hypotheses(pixels: Float64s, weight: Float64s, now: int) -> list[str]:

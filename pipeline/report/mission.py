@@ -14,13 +14,14 @@ import numpy as np
 import pyarrow as pa
 
 from cadence.arrays import Float32s, Float64s, Int64s
+from cadence.constraints.obstacles import Obstacles
 from cadence.errors import InputError
 from pipeline.catalogue import Catalogue, read_catalogue, stated_path
 from pipeline.documents import parse_json
 from pipeline.files import hash_file
 from pipeline.manifest import read_manifest
 from pipeline.missions import CATALOGUE_NAME
-from pipeline.obstacle_file import OBSTACLES_NAME, read_obstacle_entries
+from pipeline.obstacle_file import OBSTACLES_NAME, as_obstacles, read_obstacle_entries
 from pipeline.presence import with_presence
 from pipeline.report.origins import Origins, origins_of, with_likeliest
 from pipeline.results import AgentHypotheses, MissionHypotheses, WindowHypotheses, read_hypothesis_tables
@@ -28,6 +29,9 @@ from pipeline.tables import Frame, read_table
 from pipeline.tracks import UNKNOWN_AGENT
 
 JsonDict = dict[str, Any]
+
+LIKELY = 0.5
+"""An agent that is less likely there than this is rather none, as for `cadence evaluate`."""
 
 STAGES = ("ingest", "extract", "infer", "export", "evaluate")
 """Stages whose manifests the page shows, in the order of the work."""
@@ -116,6 +120,7 @@ class Mission:
     start_ns, end_ns          of what is drawn: detections, truth, window origins
     log_start_ns, log_end_ns  of the log, where it keeps the same clock
     origins                   who was found among detections of unknown origin; these are given to their likeliest agent
+    stored, solid             hypotheses and obstacles as other stages see them
     """
 
     log: str
@@ -136,12 +141,30 @@ class Mission:
     end_ns: int
     log_start_ns: int
     log_end_ns: int
+    stored: MissionHypotheses
+    solid: Obstacles | None = None
     origins: Origins | None = None
 
     def called(self, agent: int, rows: Iterable[WindowRow]) -> str:
         """The agent's name with how likely it is there: the largest probability among `rows`, which are its own."""
         found = [row.probability for row in rows if row.probability is not None]
         return with_presence(self.agents[agent], max(found, default=None))
+
+    def presence(self, agent: int) -> float | None:
+        """How likely an agent is there, in the window where it is likeliest; None where the log says who was seen."""
+        found = [row.probability for row in self.rows if row.agent == agent and row.probability is not None]
+        return max(found, default=None)
+
+    @property
+    def suspicions(self) -> list[JsonDict]:
+        """What stages found that can hardly be meant."""
+        summaries = (self.manifests.get(stage, {}).get("summary") or {} for stage in ("extract", "infer"))
+        return [record for summary in summaries for record in summary.get("suspicions") or []]
+
+    @property
+    def has_presence(self) -> bool:
+        """Whether agents may be none: the log does not say who was seen."""
+        return any(row.probability is not None for row in self.rows)
 
     @property
     def name(self) -> str:
@@ -152,6 +175,11 @@ class Mission:
     def num_tracked(self) -> int:
         """Agents that have hypotheses; the others are only in the truth, or of them nothing can be said."""
         return len({fan.agent for fan in self.fans})
+
+    @property
+    def told_agents(self) -> tuple[int, ...]:
+        """Agents that the map lists: those with hypotheses; where nobody has any, those that were looked for."""
+        return tuple(sorted({fan.agent for fan in self.fans} or {row.agent for row in self.rows}))
 
     @property
     def drawn_windows(self) -> list[int]:
@@ -170,6 +198,7 @@ def mission_inputs(directory: Path) -> list[Path]:
     names = [CATALOGUE_NAME, "detections.parquet", "hypotheses.parquet", "windows.parquet", OBSTACLES_NAME]
     names += [
         "associations.parquet",
+        "labels.parquet",
         "truth.parquet",
         "poses.parquet",
         "scores.json",
@@ -209,7 +238,7 @@ def load_mission(directory: Path) -> Mission:
         poses=_points(poses, "sensor_id", sensors) if poses is not None else None,
         rows=rows,
         fans=_fans(hypotheses, agents),
-        obstacles=_obstacles(directory / OBSTACLES_NAME),
+        obstacles=tuple(_obstacle(entry) for entry in _obstacle_entries(directory)),
         manifests=manifests,
         scores=_read_json(scores) if scores.is_file() else None,
         has_stale_scores=_is_stale(manifests.get("evaluate"), directory / "hypotheses.parquet"),
@@ -217,6 +246,8 @@ def load_mission(directory: Path) -> Mission:
         end_ns=end_ns,
         log_start_ns=log_start_ns,
         log_end_ns=log_end_ns,
+        stored=hypotheses,
+        solid=as_obstacles(entries) if (entries := _obstacle_entries(directory)) else None,
         origins=origins,
     )
 
@@ -310,8 +341,9 @@ def _fan(window: WindowHypotheses, agent: AgentHypotheses, index: int) -> Fan | 
     )
 
 
-def _obstacles(path: Path) -> tuple[Obstacle, ...]:
-    return tuple(_obstacle(entry) for entry in read_obstacle_entries(path)) if path.is_file() else ()
+def _obstacle_entries(directory: Path) -> list[JsonDict]:
+    path = directory / OBSTACLES_NAME
+    return read_obstacle_entries(path) if path.is_file() else []
 
 
 def _obstacle(entry: JsonDict) -> Obstacle:

@@ -1,11 +1,12 @@
 """The section on detections of unknown origin: which agents were found, how many detections are theirs, how sure that is."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import pyarrow as pa
 
+from pipeline.presence import presence_words
 from pipeline.report.clock import Clock
 from pipeline.report.markup import section, table, text
 
@@ -73,29 +74,32 @@ def origins_of(detections: pa.Table, associations: pa.Table) -> Origins:
     return Origins(len(row), sum(agent is None for agent in name), tuple(found))
 
 
-def origins_section(origins: Origins | None, start_ns: int, end_ns: int) -> str:
-    """A table of the agents that were found; empty where the log names its agents."""
+def origins_section(
+    origins: Origins | None, start_ns: int, end_ns: int, presence: Mapping[str, float | None], num_tracked: int
+) -> str:
+    """A table of the agents that were found, with how likely they are there; empty where the log names its agents."""
     if origins is None:
         return ""
     clock = Clock(start_ns, end_ns)
-    rows = [_row(agent, origins.num_detections, clock) for agent in origins.agents]
-    heads = ["agent", "detections", "90 % sure", "expected number", "first", "last"]
-    content = table(heads, rows[:OPEN_ROWS], numeric=(1, 2, 3))
+    rows = [_row(agent, presence.get(agent.agent_id), origins.num_detections, clock) for agent in origins.agents]
+    heads = ["agent", "there at best", "detections", "90 % sure", "expected number", "first", "last"]
+    content = table(heads, rows[:OPEN_ROWS], numeric=(1, 2, 3, 4))
     if len(rows) > OPEN_ROWS:
-        rest = table(heads, rows[OPEN_ROWS:MAX_ROWS], numeric=(1, 2, 3))
+        rest = table(heads, rows[OPEN_ROWS:MAX_ROWS], numeric=(1, 2, 3, 4))
         content += f"<details><summary>{len(rows) - OPEN_ROWS} more agents</summary>{rest}</details>"
     sure = sum(agent.num_sure for agent in origins.agents)
     lead = (
-        f"The log does not say who caused {origins.num_detections:,} of its detections. {len(origins.agents):,} agents explain "
-        f"them best; {origins.num_clutter:,} detections are rather nobody’s. Of {sure:,} it is at least 90 % sure whose they "
-        "are, as known at the end of the log. Hypotheses differ in whose the others are; elsewhere on this page each is shown "
-        "with its likeliest agent."
+        f"The log does not say who caused {origins.num_detections:,} of its detections. {num_tracked:,} agents were "
+        f"found, {len(origins.agents):,} of them the likeliest source of a detection; {origins.num_clutter:,} detections "
+        f"are rather nobody’s. Of {sure:,} it is at least 90 % sure whose they are, as known at the end of the log. Hypotheses "
+        "differ in whose the others are; elsewhere on this page each is shown with its likeliest agent."
     )
     return section("Agents of unknown origin", content, lead)
 
 
-def _row(agent: FoundAgent, num_detections: int, clock: Clock) -> Sequence[str]:
+def _row(agent: FoundAgent, chance: float | None, num_detections: int, clock: Clock) -> Sequence[str]:
     return [
-        text(agent.agent_id), f"{agent.num_detections:,} of {num_detections:,}", f"{agent.num_sure:,}",
-        f"{agent.num_expected:.1f}", text(clock.moment(agent.start_ns)), text(clock.moment(agent.end_ns)),
+        text(agent.agent_id), text(presence_words(chance)), f"{agent.num_detections:,} of {num_detections:,}",
+        f"{agent.num_sure:,}", f"{agent.num_expected:.1f}",
+        text(clock.moment(agent.start_ns)), text(clock.moment(agent.end_ns)),
     ]  # fmt: skip

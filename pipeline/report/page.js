@@ -21,17 +21,24 @@
     const window_ = i2(code.window), agent = i2(code.agent), numK = i2(code.num_hypotheses), numS = i2(code.num_vertices);
     const centre = f4(code.centre_m), scale = f4(code.scale_m);
     const step = i2(code.step), weight = f4(code.weight), hypothesis = i2(code.hypothesis), summary = i2(code.summary);
+    const numR = i2(code.num_strands), strand = i2(code.strand);
     const found = [];
-    let atS = 0, atK = 0, atH = 0;
+    let atS = 0, atK = 0, atH = 0, atR = 0, atB = 0;
     for (let f = 0; f < window_.length; f++) {
       const k = numK[f], s = numS[f];
       const steps = step.subarray(atS, atS + s);
+      const strands = Array.from({ length: numR[f] }, (_, r) => {
+        const [first, last, hypothesis, share, apart, direction] = strand.subarray(6 * (atR + r), 6 * (atR + r + 1));
+        const own = { first, last, hypothesis, share: share / 1000, apart, direction, summary: summary.subarray(6 * atB, 6 * (atB + last - first + 1)) };
+        atB += last - first + 1;
+        return own;
+      });
       found.push({
         window: window_[f], agent: agent[f], numK: k, numS: s, x: centre[2 * f], y: centre[2 * f + 1], scale: scale[f], steps,
         weight: weight.subarray(atK, atK + k), hypothesis: hypothesis.subarray(atH, atH + 2 * k * s),
-        summary: summary.subarray(6 * atS, 6 * (atS + s)), now: Math.max(0, steps.indexOf(data.origin_index)), paths: null,
+        strands, now: Math.max(0, steps.indexOf(data.origin_index)), paths: null,
       });
-      atS += s; atK += k; atH += 2 * k * s;
+      atS += s; atK += k; atH += 2 * k * s; atR += numR[f];
     }
     return found;
   }
@@ -47,7 +54,8 @@
   // ---- state ---------------------------------------------------------------
   const canvas = byId("map"), pen = canvas.getContext("2d");
   const slider = byId("window"), readout = byId("readout"), moment = byId("moment"), playButton = byId("play");
-  const state = { window: 0, x: 0, y: 0, scale: 1, agents: new Set(data.agents.keys()), timer: 0, isPrinting: false, span: data.shown_share };
+  const state = { window: 0, x: 0, y: 0, scale: 1, agents: new Set([...data.agents.keys()].filter((agent) => !data.unlikely.includes(agent))), timer: 0, isPrinting: false, span: data.shown_share };
+  const isHidden = (owner) => shownOf.has(owner) && !state.agents.has(shownOf.get(owner));
   const layers = {};
   for (const box of document.querySelectorAll("[data-layer]")) {
     layers[box.dataset.layer] = box.checked;
@@ -91,12 +99,16 @@
     box.left = Math.min(box.left, x); box.right = Math.max(box.right, x);
     box.low = Math.min(box.low, y); box.high = Math.max(box.high, y);
   }
+  // All of the bands, at their full reach.
   function growByFan(box, fan) {
     const [start, end] = shownVertices(fan);
-    for (let s = start; s <= end; s++) {
-      const at = 6 * s, reach = Math.min(fan.summary[at + 2] * fan.scale * 0.7, 1e9);
-      const x = fan.x + fan.summary[at] * fan.scale, y = fan.y + fan.summary[at + 1] * fan.scale;
-      grow(box, x - reach, y - reach); grow(box, x + reach, y + reach);
+    for (const strand of fan.strands) {
+      for (let v = Math.max(start, strand.first); v <= Math.min(end, strand.last); v++) {
+        const at = 6 * (v - strand.first), angle = strand.summary[at + 4] / 10000, [x, y] = meanOf(fan, strand, v);
+        const a = strand.summary[at + 2] * fan.scale, b = strand.summary[at + 3] * fan.scale;
+        const wide = Math.hypot(a * Math.cos(angle), b * Math.sin(angle)), high = Math.hypot(a * Math.sin(angle), b * Math.cos(angle));
+        grow(box, x - wide, y - high); grow(box, x + wide, y + high);
+      }
     }
   }
   function show(box) {
@@ -111,10 +123,8 @@
     for (const points of [detections, truth]) {
       if (points) for (let i = 0; i < points.time.length; i++) grow(box, points.position[2 * i], points.position[2 * i + 1]);
     }
-    for (const fan of fans) {
-      const [start, end] = shownVertices(fan);
-      for (let at = 6 * start; at <= 6 * end; at += 6) grow(box, fan.x + fan.summary[at] * fan.scale, fan.y + fan.summary[at + 1] * fan.scale);
-    }
+    // Of agents that are rather none nothing is known.
+    for (const fan of fans) if (likelihood(fan) >= 0.5) growByFan(box, fan);
     show(box);
   }
   function fitWindow(only) {
@@ -142,18 +152,31 @@
     return Object.fromEntries(Object.keys(LIGHT).map((name) => [name, style.getPropertyValue(`--${name}`).trim() || LIGHT[name]]));
   }
 
+  // Where a strand is drawn: the mean of its hypotheses, or the one that stands for a way of several.
+  function meanOf(fan, strand, v) {
+    const at = 6 * (v - strand.first);
+    return [fan.x + strand.summary[at] * fan.scale, fan.y + strand.summary[at + 1] * fan.scale];
+  }
+  function vertexOf(fan, k, v) {
+    const at = 2 * (k * fan.numS + v);
+    return [fan.x + fan.hypothesis[at] * fan.scale, fan.y + fan.hypothesis[at + 1] * fan.scale];
+  }
+  const placeOf = (fan, strand, v) => (strand.hypothesis < 0 ? meanOf(fan, strand, v) : vertexOf(fan, strand.hypothesis, v));
+
   // Paths in metres, made when a fan is first drawn: the canvas scales them.
   function pathsOf(fan) {
     if (fan.paths && fan.paths.span === state.span) return fan.paths;
     const [start, end] = shownVertices(fan), sides = { past: [start, fan.now], future: [fan.now, end] };
-    const mean = (s) => [fan.x + fan.summary[6 * s] * fan.scale, fan.y + fan.summary[6 * s + 1] * fan.scale];
     fan.paths = { span: state.span, lines: {}, mean: {}, outer: {}, inner: {} };
     for (const [side, [first, last]] of Object.entries(sides)) {
-      fan.paths.lines[side] = Array.from({ length: fan.numK }, (_, k) => line(
-        (s) => [fan.x + fan.hypothesis[2 * (k * fan.numS + s)] * fan.scale, fan.y + fan.hypothesis[2 * (k * fan.numS + s) + 1] * fan.scale], first, last));
-      fan.paths.mean[side] = line(mean, first, last);
-      fan.paths.outer[side] = envelope(fan, first, last, false);
-      fan.paths.inner[side] = envelope(fan, first, last, true);
+      fan.paths.lines[side] = Array.from({ length: fan.numK }, (_, k) => line(new Path2D(), (v) => vertexOf(fan, k, v), first, last));
+      fan.paths.mean[side] = new Path2D(); fan.paths.outer[side] = new Path2D(); fan.paths.inner[side] = new Path2D();
+      for (const strand of fan.strands) {
+        const from = Math.max(first, strand.first), to = Math.min(last, strand.last);
+        line(fan.paths.mean[side], (v) => placeOf(fan, strand, v), from, to);
+        band(fan.paths.outer[side], fan, strand, from, to, false);
+        band(fan.paths.inner[side], fan, strand, from, to, true);
+      }
     }
     return fan.paths;
   }
@@ -165,32 +188,30 @@
     while (end < fan.numS - 1 && fan.steps[end] < high) end++;
     return [start, end];
   }
-  function line(at, first, last) {
-    const path = new Path2D();
-    for (let s = first; s <= last; s++) path[s === first ? "moveTo" : "lineTo"](...at(s));
+  function line(path, at, first, last) {
+    for (let v = first; v <= last; v++) path[v === first ? "moveTo" : "lineTo"](...at(v));
     return path;
   }
-  function ellipse(fan, s, isInner) {
-    const at = 6 * s, share = isInner ? fan.summary[at + 5] / 10000 : 1, angle = fan.summary[at + 4] / 10000;
-    const a = fan.summary[at + 2] * fan.scale * share, b = fan.summary[at + 3] * fan.scale * share;
-    const cos = Math.cos(angle), sin = Math.sin(angle), points = [];
+  function ellipse(fan, strand, v, isInner) {
+    const at = 6 * (v - strand.first), share = isInner ? strand.summary[at + 5] / 10000 : 1, angle = strand.summary[at + 4] / 10000;
+    const a = strand.summary[at + 2] * fan.scale * share, b = strand.summary[at + 3] * fan.scale * share;
+    const cos = Math.cos(angle), sin = Math.sin(angle), [x, y] = meanOf(fan, strand, v), points = [];
     for (let i = 0; i < 24; i++) {
-      const u = a * Math.cos((i * Math.PI) / 12), v = b * Math.sin((i * Math.PI) / 12);
-      points.push([fan.x + fan.summary[at] * fan.scale + u * cos - v * sin, fan.y + fan.summary[at + 1] * fan.scale + u * sin + v * cos]);
+      const u = a * Math.cos((i * Math.PI) / 12), w = b * Math.sin((i * Math.PI) / 12);
+      points.push([x + u * cos - w * sin, y + u * sin + w * cos]);
     }
     return points;
   }
   // The hulls of neighbouring ellipses, all turning the same way: filled together they are their union.
-  function envelope(fan, first, last, isInner) {
-    const path = new Path2D();
-    let before = ellipse(fan, first, isInner);
-    for (let s = first + 1; s <= last; s++) {
-      const after = ellipse(fan, s, isInner);
+  function band(path, fan, strand, first, last, isInner) {
+    if (first > last) return;
+    let before = ellipse(fan, strand, first, isInner);
+    for (let v = first + 1; v <= last; v++) {
+      const after = ellipse(fan, strand, v, isInner);
       hull(before.concat(after)).forEach(([x, y], i) => path[i ? "lineTo" : "moveTo"](x, y));
       path.closePath();
       before = after;
     }
-    return path;
   }
   function hull(points) {
     points.sort((p, q) => p[0] - q[0] || p[1] - q[1]);
@@ -229,24 +250,28 @@
     pen.fillRect(0, 0, width, height);
     pen.lineJoin = "round";
     drawGrid(colour);
-    if (layers.obstacles) drawObstacles(colour);
     const visible = [...state.agents].map((agent) => fanAt.get(state.window * 65536 + agent)).filter(Boolean);
     labelBoxes.length = 0;
+    if (layers.envelopes) inMetres(() => visible.forEach((fan) => drawEnvelopes(fan, colour)));
+    if (layers.obstacles) drawObstacles(colour);
     if (layers.everywhere) drawEverywhere(colour);
     if (layers.sensors) drawSensors(colour);
-    if (layers.envelopes) inMetres(() => visible.forEach((fan) => drawEnvelopes(fan, colour)));
     inMetres(() => visible.forEach((fan) => drawHypotheses(fan, colour)));
     if (layers.truth) drawTruth(colour);
     if (layers.mean) inMetres(() => visible.forEach((fan) => drawMean(fan, colour)));
     if (layers.detections) drawDetections(colour);
     visible.forEach((fan) => drawNow(fan, colour, visible.length));
-    if (layers.names) visible.forEach((fan) => { const [x, y] = nowOf(fan); label(data.agents[fan.agent] + (there(fan.agent) && ` (there: ${there(fan.agent)})`), x + 9, y - 7, colour.text, colour); });
+    if (layers.names) visible.forEach((fan) => { const [x, y] = nowOf(fan)[0]; label(data.agents[fan.agent] + (there(fan.agent) && ` (there: ${there(fan.agent)})`), x + 9, y - 7, colour.text, colour); });
+    if (layers.mean) visible.forEach((fan) => drawShares(fan, colour));
     drawFurniture(colour);
   }
 
   // How likely an agent is there at all in the window shown; nothing where the log says who was seen.
+  const probabilityOf = (window_, agent) => ((data.cells[window_] ?? [])[agent] ?? [])[4] ?? null;
+  // An agent is drawn as strongly as it is likely there.
+  const likelihood = (fan) => Math.max(0.1, probabilityOf(fan.window, fan.agent) ?? 1);
   function there(agent) {
-    const probability = ((data.cells[state.window] ?? [])[agent] ?? [])[4] ?? null;
+    const probability = probabilityOf(state.window, agent);
     return probability === null ? "" : `${probability > 0.99 ? "> 99" : Math.round(100 * probability)} %`;
   }
 
@@ -264,12 +289,14 @@
     pen.stroke();
   }
   function drawObstacles(colour) {
-    pen.strokeStyle = pen.fillStyle = colour.obstacle; pen.lineWidth = 1;
+    pen.strokeStyle = colour.obstacle; pen.lineWidth = 1;
     for (const item of data.obstacles) {
       pen.beginPath();
       if (item.circle) pen.arc(screenX(item.circle[0]), screenY(item.circle[1]), item.circle[2] * state.scale, 0, 2 * Math.PI);
       else for (const ring of item.rings) { ring.forEach(([x, y], i) => pen[i ? "lineTo" : "moveTo"](screenX(x), screenY(y))); pen.closePath(); }
-      pen.globalAlpha = 0.2; pen.fill("evenodd"); pen.globalAlpha = 1; pen.stroke();
+      // Nobody enters: what of a band would lie inside is covered.
+      pen.fillStyle = colour.card; pen.fill("evenodd");
+      pen.fillStyle = colour.obstacle; pen.globalAlpha = 0.2; pen.fill("evenodd"); pen.globalAlpha = 1; pen.stroke();
     }
   }
   function drawEnvelopes(fan, colour) {
@@ -277,8 +304,8 @@
     for (const side of ["past", "future"]) {
       if (!layers[side]) continue;
       pen.fillStyle = colour[side];
-      pen.globalAlpha = 0.12; pen.fill(paths.outer[side]);
-      pen.globalAlpha = 0.16; pen.fill(paths.inner[side]);
+      pen.globalAlpha = 0.12 * likelihood(fan); pen.fill(paths.outer[side]);
+      pen.globalAlpha = 0.16 * likelihood(fan); pen.fill(paths.inner[side]);
     }
     pen.globalAlpha = 1;
   }
@@ -288,7 +315,7 @@
     for (const side of ["past", "future"]) {
       if (!layers[side]) continue;
       pen.strokeStyle = colour[side];
-      for (let k = 0; k < fan.numK; k++) { pen.globalAlpha = Math.max(0.05, (base * fan.weight[k]) / heaviest); pen.stroke(paths.lines[side][k]); }
+      for (let k = 0; k < fan.numK; k++) { pen.globalAlpha = likelihood(fan) * Math.max(0.05, (base * fan.weight[k]) / heaviest); pen.stroke(paths.lines[side][k]); }
     }
     pen.globalAlpha = 1;
   }
@@ -297,10 +324,23 @@
     for (const side of ["past", "future"]) {
       if (!layers[side]) continue;
       pen.setLineDash(side === "future" ? [6 / state.scale, 4 / state.scale] : []);
-      pen.strokeStyle = colour.card; pen.lineWidth = 4 / state.scale; pen.globalAlpha = 0.6; pen.stroke(paths.mean[side]);
-      pen.strokeStyle = colour[side]; pen.lineWidth = 2.2 / state.scale; pen.globalAlpha = 1; pen.stroke(paths.mean[side]);
+      pen.strokeStyle = colour.card; pen.lineWidth = 4 / state.scale; pen.globalAlpha = 0.6 * likelihood(fan); pen.stroke(paths.mean[side]);
+      pen.strokeStyle = colour[side]; pen.lineWidth = 2.2 / state.scale; pen.globalAlpha = likelihood(fan); pen.stroke(paths.mean[side]);
     }
+    pen.globalAlpha = 1;
     pen.setLineDash([]);
+  }
+
+  // Of hypotheses that go several ways: how many go each, where they are furthest apart.
+  function drawShares(fan, colour) {
+    if (likelihood(fan) < 0.5) return;
+    const [start, end] = shownVertices(fan);
+    for (const strand of fan.strands) {
+      const side = strand.apart > fan.now ? "future" : "past";
+      if (strand.apart < start || strand.apart > end || strand.share === 1 || !layers[side]) continue;
+      const [x, y] = placeOf(fan, strand, strand.apart);
+      label(`${Math.round(100 * strand.share)} % ${data.directions[strand.direction]}`, screenX(x) + 6, screenY(y) - 4, colour[side], colour);
+    }
   }
 
   const backSeconds = (share) => share * data.origin_index * data.step_s;
@@ -323,14 +363,14 @@
     if (!truth) return;
     const { first, last } = shownTimes();
     pen.strokeStyle = colour.truth; pen.lineWidth = 2; pen.lineCap = "round"; pen.setLineDash([1.5, 4.5]);
-    for (const [owner, indices] of truthOf) if (state.agents.has(shownOf.get(owner))) drawTrack(truth, indices, first, last);
+    for (const [owner, indices] of truthOf) if (!isHidden(owner)) drawTrack(truth, indices, first, last);
     pen.setLineDash([]); pen.lineCap = "butt";
   }
   function drawSensors(colour) {
     if (!poses) return;
     const { now, first } = shownTimes();
-    pen.strokeStyle = pen.fillStyle = colour.sensor; pen.lineWidth = 1.2;
     for (const [owner, indices] of posesOf) {
+      pen.strokeStyle = pen.fillStyle = colour.sensor; pen.lineWidth = 1.2; // the name of the sensor before has other ones
       pen.globalAlpha = 0.6; drawTrack(poses, indices, first, now); pen.globalAlpha = 1;
       let latest = -1;
       for (const i of indices) { if (poses.time[i] > now) break; latest = i; }
@@ -348,7 +388,7 @@
     while (from < to) { const middle = (from + to) >> 1; if (detections.time[middle] < first) from = middle + 1; else to = middle; }
     for (let i = from; i < detections.time.length && detections.time[i] <= last; i++) {
       const owner = detections.owner[i];
-      if (owner >= 0 && !state.agents.has(shownOf.get(owner))) continue;
+      if (isHidden(owner)) continue;
       const x = screenX(detections.position[2 * i]), y = screenY(detections.position[2 * i + 1]);
       // Of detections that would cover each other one is drawn: dense bursts stay dots.
       const other = latest.get(owner), isLater = detections.time[i] > now + 0.0006;
@@ -369,21 +409,29 @@
     pen.fillStyle = colour.detection; pen.globalAlpha = 0.22;
     for (let i = 0; i < detections.time.length; i++) {
       const owner = detections.owner[i];
-      if (owner < 0 || state.agents.has(shownOf.get(owner))) pen.fillRect(screenX(detections.position[2 * i]) - 1, screenY(detections.position[2 * i + 1]) - 1, 2, 2);
+      if (!isHidden(owner)) pen.fillRect(screenX(detections.position[2 * i]) - 1, screenY(detections.position[2 * i + 1]) - 1, 2, 2);
     }
     pen.globalAlpha = 1;
   }
-  const nowOf = (fan) => [screenX(fan.x + fan.summary[6 * fan.now] * fan.scale), screenY(fan.y + fan.summary[6 * fan.now + 1] * fan.scale)];
+  // Where an agent is at the moment, one place for each way, the likeliest first.
+  function nowOf(fan) {
+    const there = fan.strands.filter((strand) => strand.first <= fan.now && fan.now <= strand.last);
+    const ways = there.filter((strand) => strand.hypothesis >= 0);
+    return (ways.length ? ways : there).map((strand) => placeOf(fan, strand, fan.now)).map(([x, y]) => [screenX(x), screenY(y)]);
+  }
   function drawNow(fan, colour, count) {
-    const [x, y] = nowOf(fan);
     pen.strokeStyle = colour.text; pen.lineWidth = 1.6;
-    pen.beginPath(); pen.arc(x, y, count > 12 ? 4.5 : 6, 0, 2 * Math.PI); pen.stroke();
+    pen.globalAlpha = likelihood(fan);
+    for (const [x, y] of nowOf(fan)) { pen.beginPath(); pen.arc(x, y, count > 12 ? 4.5 : 6, 0, 2 * Math.PI); pen.stroke(); }
+    pen.globalAlpha = 1;
   }
   function label(text, x, y, fill, colour) {
     const shown = text.length > 24 ? `${text.slice(0, 23)}…` : text;
     pen.font = "12px system-ui, sans-serif";
-    // A name that would cover another one is left out; zooming in brings it back.
-    const box = [x, y - 11, x + pen.measureText(shown).width, y + 3];
+    // A name that would cover another one is left out; zooming in brings it back. At the edge it stands on the other side.
+    const wide = pen.measureText(shown).width;
+    if (x + wide > width) x -= wide + 18;
+    const box = [x, y - 11, x + wide, y + 3];
     if (labelBoxes.some((other) => box[0] < other[2] && other[0] < box[2] && box[1] < other[3] && other[1] < box[3])) return;
     labelBoxes.push(box);
     pen.lineWidth = 3; pen.strokeStyle = colour.card; pen.fillStyle = fill;
@@ -405,7 +453,7 @@
   const list = byId("agents");
   const cellTexts = data.agents.map((name, agent) => {
     const item = document.createElement("li"), box = document.createElement("input"), button = document.createElement("button"), text = document.createElement("span");
-    box.type = "checkbox"; box.checked = true; box.setAttribute("aria-label", `show ${name}`);
+    box.type = "checkbox"; box.checked = state.agents.has(agent); box.setAttribute("aria-label", `show ${name}`);
     box.addEventListener("change", () => { if (box.checked) state.agents.add(agent); else state.agents.delete(agent); draw(); });
     button.type = "button"; button.textContent = name; button.title = `${name}: zoom to it`;
     button.addEventListener("click", () => { box.checked = true; state.agents.add(agent); fitWindow(agent); });
@@ -413,6 +461,19 @@
     list.append(item);
     return text;
   });
+  // Of many agents the list shows those whose names hold what is typed, and says how many there are.
+  const MOST_LISTED = 60, search = byId("search"), count = byId("agent-count");
+  function filter() {
+    const wanted = search.value.toLowerCase(), items = [...list.children];
+    const found = items.filter((_, agent) => data.agents[agent].toLowerCase().includes(wanted));
+    items.forEach((item) => { item.hidden = true; });
+    found.slice(0, MOST_LISTED).forEach((item) => { item.hidden = false; });
+    count.textContent = found.length > MOST_LISTED ? `${MOST_LISTED} of ${found.length} agents listed: type a part of a name to find others` : wanted ? `${found.length} of ${items.length} agents` : "";
+  }
+  search.hidden = data.agents.length <= 12;
+  search.addEventListener("input", filter);
+  filter();
+
   function setAgents(isShown) {
     for (const box of list.querySelectorAll("input")) box.checked = isShown;
     state.agents = new Set(isShown ? data.agents.keys() : []);

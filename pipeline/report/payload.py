@@ -16,15 +16,17 @@ from cadence.arrays import Float64s
 from pipeline.arrays import Column
 from pipeline.report.fans import FanCode
 from pipeline.report.geodesy import GeodesyFit
-from pipeline.report.mission import Mission, Points, WindowRow
+from pipeline.report.mission import LIKELY, Mission, Points, WindowRow
+from pipeline.report.modes import DIRECTIONS
 
 
 @dataclass(frozen=True, eq=False)
 class Payload:
-    """The JSON of the interactive map, and sentences on what it leaves out."""
+    """The JSON of the interactive map, sentences on what it leaves out, and in how many of how many fans ways part."""
 
     content: dict[str, Any]
     notes: tuple[str, ...]
+    num_parted: tuple[int, int]
 
 
 def build_payload(
@@ -50,6 +52,8 @@ def build_payload(
         "agent": [int(agent) for agent in agents],
         "all_agents": list(mission.agents),
         "sensors": list(mission.sensors),
+        "directions": list(DIRECTIONS),
+        "unlikely": _unlikely(mission, agents),
         "window": [int(window) for window in windows],
         "origin_s": [_seconds(mission, mission.origins_ns[window]) for window in windows],
         "cells": [[_cell(rows.get((window, agent))) for agent in agents] for window in windows],
@@ -76,7 +80,14 @@ def build_payload(
     for name, points, count in zip(kinds, (mission.detections, mission.truth, mission.poses), kept, strict=True):
         if points is not None and count < len(points):
             notes.append(f"{count:,} of {len(points):,} {name}, evenly thinned")
-    return Payload(content, tuple(notes))
+    num_parted = sum(bool((code.strand[:, 3] < 1000).any()) for code in codes)
+    return Payload(content, tuple(notes), (num_parted, len(codes)))
+
+
+def _unlikely(mission: Mission, agents: Sequence[int]) -> list[int]:
+    """Places of agents that are rather none than there in every window; empty where that would be all."""
+    found = [place for place, agent in enumerate(agents) if (chance := mission.presence(agent)) is not None and chance < LIKELY]
+    return found if len(found) < len(agents) else []
 
 
 def _notes(mission: Mission, codes: Sequence[FanCode], windows: Sequence[int], agents: Sequence[int]) -> list[str]:
@@ -84,15 +95,15 @@ def _notes(mission: Mission, codes: Sequence[FanCode], windows: Sequence[int], a
     drawn = mission.drawn_windows
     if len(windows) < len(drawn):
         notes.append(f"{len(windows)} of {len(drawn)} windows")
-    if len(agents) < len(mission.agents):
-        notes.append(f"{len(agents)} of {len(mission.agents)} agents, those with the most detections")
+    if len(agents) < len(mission.told_agents):
+        notes.append(f"{len(agents)} of {len(mission.told_agents)} agents, those with the most detections")
     if codes and mission.fans:
         shown, computed = max(len(code.weight) for code in codes), max(len(fan.weight) for fan in mission.fans)
         if shown < computed:
-            notes.append(f"the {shown} heaviest of {computed} hypotheses (means and envelopes use all)")
+            notes.append(f"the {shown} heaviest of {computed} hypotheses (means, bands and shares use all)")
         shown, computed = max(len(code.step) for code in codes), max(fan.offset_m.shape[1] for fan in mission.fans)
         if shown < computed:
-            notes.append(f"{shown} vertices for {computed} steps a hypothesis")
+            notes.append(f"lines of {shown} points for {computed} steps")
     return notes
 
 
@@ -154,6 +165,8 @@ def _encode_fans(codes: Sequence[FanCode], windows: Sequence[int], agents: Seque
         "step": _joined([code.step for code in codes], "<i2"),
         "weight": _joined([code.weight for code in codes], "<f4"),
         "hypothesis": _joined([code.hypothesis for code in codes], "<i2"),
+        "num_strands": _base64([len(code.strand) for code in codes], "<i2"),
+        "strand": _joined([code.strand for code in codes], "<i2"),
         "summary": _joined([code.summary for code in codes], "<i2"),
     }
 

@@ -5,13 +5,16 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from pipeline.report.analysis import Analysis, Moment, Trouble, find_troubles, shape_of, shown_share, shown_steps
+from pipeline.report.analysis import Analysis, Moment, Trouble, find_troubles, shown_share, shown_steps
 from pipeline.report.charts import SpreadAxis, TimeAxis, uncertainty_chart
 from pipeline.report.clock import Clock, duration
 from pipeline.report.lengths import metres
 from pipeline.report.maps import moment_map
 from pipeline.report.markup import label, legend, section, table, text
 from pipeline.report.mission import Fan, Mission, WindowRow
+from pipeline.report.modes import Strand, strands_of
+from pipeline.report.scored import truth_of
+from pipeline.report.shapes import shape_of
 
 OPEN_ROWS, MAX_ROWS, MAX_RUNS = 10, 300, 4
 OPEN_CHART_ROWS, MAX_CHART_ROWS = 8, 60
@@ -31,23 +34,41 @@ def moments_section(mission: Mission, analysis: Analysis, moments: Sequence[Mome
         fan = mission.fans[moment.fan]
         row, error_m = rows.get((fan.window, fan.agent)), analysis.error_now_m[moment.fan]
         age = None if row is None else row.age_s
+        strands = strands_of(fan, shape_of(fan), mission.solid)
         words = [f"{mission.called(fan.agent, [row] if row else [])} at {clock.moment(fan.origin_ns)}"]
         words += [f"spread {metres(analysis.spread_now_m[moment.fan])}"]
-        words += [f"last seen {duration(age)} before"] if age is not None else []
-        words += [f"mean {metres(error_m)} from truth"] if np.isfinite(error_m) else []
+        words += [f"last seen {duration(abs(age))} before"] if age is not None else []
+        words += ["seen only once until then"] if row is not None and row.num_detections == 1 else []
+        words += [f"a hypothesis is {metres(error_m)} from the truth"] if np.isfinite(error_m) else []
+        words += _ways(strands, fan.origin_index)
         steps = _moment_steps(mission, fan, share)
         if share < 1:
             back, ahead = (duration(abs(step - fan.origin_index) * fan.step_ns / 1e9) for step in steps)
             words += [f"drawn {back} back and {ahead} ahead"]
-        drawing = moment_map(mission, fan, shape_of(fan), steps, f"{moment.reason}. {', '.join(words)}")
+        truth = truth_of(mission, analysis.scored, fan.window, fan.agent)
+        drawing = moment_map(mission, fan, strands, truth, steps, f"{moment.reason}. {', '.join(words)}")
         place = f'data-seconds="{(fan.origin_ns - mission.start_ns) / 1e9:.3f}" data-agent="{fan.agent}"'
         figures.append(
             f"<figure>{drawing}<figcaption><strong>{text(moment.reason)}.</strong> {text(', '.join(words))}. "
             f'<button type="button" class="only-script" {place}>On the map</button>'
             "</figcaption></figure>"
         )
-    lead = "Windows that deserve a look, one agent each. North is up; scales differ."
+    lead = (
+        "Moments that deserve a look, one agent each. North is up; scales differ. Where hypotheses part into several ways, "
+        "each is drawn as one of its hypotheses, with its share."
+    )
+    lead += " Agents that are less than 50 % likely there are left out." if mission.has_presence else ""
     return section("Chosen moments", f'<div class="moments">{"".join(figures)}</div>', lead)
+
+
+def _ways(strands: Sequence[Strand], now: int) -> list[str]:
+    """In words: the ways at the moment, and those at the end."""
+    found = []
+    for when, step in (("now", now), ("at the end", strands[-1].last)):
+        ways = [strand for strand in strands if strand.share < 1 and strand.first <= step <= strand.last]
+        if len(ways) > 1 and strands[-1].last > now:
+            found.append(f"{when} " + ", ".join(f"{100 * way.share:.0f} % {way.direction}" for way in ways))
+    return found
 
 
 def _moment_steps(mission: Mission, fan: Fan, share: float) -> tuple[int, int]:
@@ -72,15 +93,18 @@ def uncertainty_section(mission: Mission, analysis: Analysis) -> str:
     if len(agents) > MAX_CHART_ROWS:
         content += f'<p class="note">{len(agents) - MAX_CHART_ROWS} more agents with a smaller spread are not drawn.</p>'
     keys = (
-        ('<polyline class="past mean" points="0,8 26,8"/>', "spread at the origin"),
-        ('<polyline class="future mean solid" points="0,8 26,8"/>', "spread at the end of the horizon"),
+        ('<polyline class="past mean" points="0,8 26,8"/>', "spread at the window’s moment"),
+        ('<polyline class="future mean solid" points="0,8 26,8"/>', "spread at the end of its future"),
         ('<path class="tick" d="M13 3v10"/>', "detection"),
         ('<rect class="void" x="3" y="2" width="20" height="12"/>', "windows without hypotheses"),
     )
-    lead = "Spread is the root mean square distance of hypotheses from their mean, on a logarithmic scale shared by all agents."
+    lead = (
+        "How far hypotheses are from their middle (root mean square), window after window; each line of the grid is ten times "
+        "the one below it, the same for all agents."
+    )
     if len(agents) > 1:
-        name = mission.agents[agents[0]]
-        lead += f" Agents are sorted by their median spread at the origin; {name} has the largest, {metres(widest_m)}."
+        name = mission.called(agents[0], [row for row in mission.rows if row.agent == agents[0]])
+        lead += f" Agents are sorted by their median spread; {name} has the largest, {metres(widest_m)}."
     return section("Uncertainty over time", content + legend(keys), lead)
 
 
@@ -96,7 +120,7 @@ def trouble_section(mission: Mission) -> str:
     """Windows with a status other than ok: a table for each piece of advice, a row an agent."""
     troubles = find_troubles(mission)
     if not troubles:
-        return section("Windows that need attention", "<p>None: every window of every agent has status ok.</p>")
+        return section("Windows that need attention", "<p>None: every window of every agent is ok.</p>")
     kinds: dict[tuple[str, str], dict[int, list[Trouble]]] = {}
     for trouble in troubles:
         # Advice that differs only in its numbers is one piece of advice; the first stands for all.
@@ -104,14 +128,14 @@ def trouble_section(mission: Mission) -> str:
         kinds.setdefault(kind, {}).setdefault(trouble.agent, []).append(trouble)
     content = "".join(_trouble_table(mission, runs) for runs in kinds.values())
     bad = sum(trouble.count for trouble in troubles)
-    lead = f"{bad:,} of the {len(mission.rows):,} pairs of a window and an agent have a status other than ok."
+    lead = f"{bad:,} of the {len(mission.rows):,} pairs of a window and an agent are not ok."
     return section("Windows that need attention", content, lead)
 
 
 def _trouble_table(mission: Mission, runs: Mapping[int, Sequence[Trouble]]) -> str:
     first = next(iter(runs.values()))[0]
     clock = Clock(mission.start_ns, mission.end_ns)
-    heads, rows = ["agent", "count", "windows", "origins"], []
+    heads, rows = ["agent", "count", "windows", "their moments"], []
     for agent, found in sorted(runs.items()):
         words = [" to ".join(clock.moment(row.origin_ns) for row in _ends(trouble)) for trouble in found]
         spans = ", ".join(words[:MAX_RUNS]) + (f" and {len(words) - MAX_RUNS} more" if len(words) > MAX_RUNS else "")

@@ -13,13 +13,16 @@ from tqdm import tqdm
 from cadence.arrays import Float64s
 from pipeline.manifest import JsonObject, StageResult, run_stage
 from pipeline.progress import Progress
-from pipeline.report.analysis import Analyser, Analysis, Moment, choose_moments, shape_of, shown_share
+from pipeline.report.analysis import Moment, analyse, choose_moments, shown_share
 from pipeline.report.charts import MAX_TICKS
 from pipeline.report.fans import Detail, FanCode, choose_detail, encode_fan
 from pipeline.report.geodesy import fit_geodesy
 from pipeline.report.mission import Mission, load_mission, mission_inputs
+from pipeline.report.modes import strands_of
 from pipeline.report.page import write_page
 from pipeline.report.payload import Payload, build_payload
+from pipeline.report.scored import score_mission
+from pipeline.report.shapes import shape_of
 
 FIXED_BYTES, BYTES_A_POINT, BYTES_A_CELL, BYTES_A_TICK = 300_000, 25, 60, 14
 """Room for what is not a fan of the interactive map: text and small maps, points, window rows, ticks in the charts."""
@@ -63,7 +66,7 @@ def report(directory: Path, config: ReportConfig, progress: Progress, force: boo
     def body(work: Path) -> JsonObject:
         mission = load_mission(directory)
         with progress.bar(2 * len(mission.fans), "report", unit="fan") as bar:
-            analysis = _analyse(mission, bar)
+            analysis = analyse(mission, score_mission(directory, mission), bar.update)
             moments = choose_moments(mission, analysis, config.num_moments)
             payload = _payload(mission, config, moments, bar)
         page = write_page(mission, analysis, payload, moments)
@@ -89,24 +92,15 @@ def _assets() -> list[Path]:
     return [folder / "page.css", folder / "page.js", folder / "explorer.html"]
 
 
-def _analyse(mission: Mission, bar: "tqdm[Any]") -> Analysis:
-    analyser = Analyser(mission)
-    for fan in mission.fans:
-        analyser.add(fan, shape_of(fan))
-        bar.update(1)
-    return analyser.result()
-
-
 def _payload(mission: Mission, config: ReportConfig, moments: Sequence[Moment], bar: "tqdm[Any]") -> Payload:
-    wanted = Detail(len(mission.drawn_windows), len(mission.agents), config.max_hypotheses, config.max_vertices)
+    wanted = Detail(len(mission.drawn_windows), len(mission.told_agents), config.max_hypotheses, config.max_vertices)
     detail = choose_detail(mission, _budget_bytes(mission, config), wanted)
     windows = _shown_windows(mission, detail.num_windows, [mission.fans[moment.fan].window for moment in moments])
-    agents = _shown_agents(mission, detail.num_agents)
+    agents = _shown_agents(mission, detail.num_agents, [mission.fans[moment.fan].agent for moment in moments])
     shown_windows, shown_agents, codes = set(windows), set(agents), list[FanCode]()
     for fan in mission.fans:
-        # Shapes are computed again rather than kept: those of a long mission do not fit into memory beside its hypotheses.
         if fan.window in shown_windows and fan.agent in shown_agents:
-            codes.append(encode_fan(fan, shape_of(fan), detail))
+            codes.append(encode_fan(fan, strands_of(fan, shape_of(fan), mission.solid), detail))
         bar.update(1)
     geodesy = fit_geodesy(mission.frame, *_extent(mission, codes))
     return build_payload(mission, codes, windows, agents, geodesy, config.max_points, shown_share(mission))
@@ -131,9 +125,10 @@ def _shown_windows(mission: Mission, count: int, always: Sequence[int]) -> list[
     return [windows[place] for place in np.unique(chosen)]
 
 
-def _shown_agents(mission: Mission, count: int) -> list[int]:
+def _shown_agents(mission: Mission, count: int, always: Sequence[int]) -> list[int]:
+    """`count` agents: those `always` shown, and those with the most detections."""
     frequency = Counter(mission.detections.owner.tolist())
-    ranked = sorted(range(len(mission.agents)), key=lambda agent: (-frequency[agent], agent))
+    ranked = sorted(mission.told_agents, key=lambda agent: (agent not in always, -frequency[agent], agent))
     return sorted(ranked[:count])
 
 

@@ -10,11 +10,9 @@ _COLUMNS = {
 
 def suspicions_section(mission: Mission) -> str:
     """A row a suspicion of the stages; nothing where they have none."""
-    summaries = (mission.manifests.get(stage, {}).get("summary") or {} for stage in ("extract", "infer"))
-    found = [record for summary in summaries for record in summary.get("suspicions") or []]
-    if not found:
+    if not mission.suspicions:
         return ""
-    rows = [[text(record.get(name, "")) for name in _COLUMNS] for record in found]
+    rows = [[text(record.get(name, "")) for name in _COLUMNS] for record in mission.suspicions]
     lead = "This can hardly be meant as it stands. All that follows rests on what was made of it."
     content = f'<div class="problem">{table(list(_COLUMNS.values()), rows)}</div>'
     return section("What is suspected", content, lead)

@@ -1,68 +1,113 @@
-"""The section on truth: quick figures of this stage, and the headline of evaluate where it has run."""
+"""The section on truth: figures of `cadence evaluate`, with rivals and intervals where it has run, and the laws of motion."""
 
 from collections.abc import Mapping
 from typing import Any
 
-from pipeline.report.analysis import Analysis, TruthScore
+from pipeline.report.analysis import Analysis
 from pipeline.report.lengths import metres
 from pipeline.report.markup import label, table, text
 from pipeline.report.markup import section as card
 from pipeline.report.mission import Mission
+from pipeline.report.scored import PARTS, Scored
+from pipeline.score_words import estimator_words
 
 METRICS = {
-    "energy_score_m": "energy score (m)",
-    "ade_m": "mean error of a hypothesis (m)",
-    "coverage_90": "coverage of the 90 % region",
+    "energy_score_m": "energy score",
+    "ade_m": "a hypothesis is off by",
+    "mean_error_m": "their mean is off by",
+    "coverage_50": "in the 50 % region",
+    "coverage_90": "in the 90 % region",
 }
 """Metrics of scores.json that are shown, and what they are called here."""
 
+QUICK = tuple(metric for metric in METRICS if metric != "energy_score_m")
+"""What needs no run of evaluate."""
+
+MOTION = {
+    "fast_step_share": "steps too fast", "fast_track_share": "tracks with such a step", "speed_w1_mps": "speed off by (m/s)",
+    "acceleration_w1_mps2": "acceleration off by (m/s²)", "turn_w1_deg": "turn a step off by (°)",
+}  # fmt: skip
+"""The same of how tracks move."""
+
+WORDS = (
+    "Every step from an agent’s first detection in a window on counts once; neighbouring steps are not independent. Half of "
+    "the truth should lie in the 50 % region, and 90 % in the 90 % region. The energy score, where it stands, is the distance "
+    "of all hypotheses together from the truth: less where they are nearer and say more honestly how unsure they are."
+)
+MOTION_WORDS = (
+    "Whether tracks move as the targets do. Too fast: faster than all true steps but one in a thousand. Off by: how far "
+    "speeds, accelerations and turns must be shifted, on average, to be distributed as the true ones (Wasserstein’s distance)."
+)
+
 
 def truth_section(mission: Mission, analysis: Analysis) -> str:
-    """Quick figures; the careful ones are those of evaluate, which are shown too where they are there."""
-    if mission.truth is None and mission.scores is None:
+    """The table of evaluate where it has run on these hypotheses, else the same figures without intervals and rivals."""
+    scored = analysis.scored
+    if not scored and mission.scores is None:
         return ""
-    sides = (("past, origin included", analysis.past), ("future", analysis.future))
-    rows = [_score_row(name, score) for name, score in sides if score is not None]
-    heads = ["steps", "compared", "mean error of the mean", "median error of the mean", "truth inside the 90 % band"]
-    none = "<p>Truth covers no step of any window.</p>"
-    content = table(heads, rows, numeric=(1, 2, 3, 4), kind="compact") if rows else none
-    if mission.scores is not None:
-        content += f"<h3>Scores of cadence evaluate</h3>{_scores(mission, mission.scores)}"
-    lead = (
-        "Quick figures from truth in the log: every step from an agent’s first detection in the window on counts once, and "
-        "neighbouring steps are not independent. A well-calibrated 90 % band holds truth about 90 % of the time. "
-        "cadence evaluate gives scores with intervals and beside rivals."
+    content = ""
+    if mission.scores is not None and mission.has_stale_scores:
+        content += "<p>scores.json belongs to other hypotheses than these; run cadence evaluate and cadence report again.</p>"
+    if mission.scores is not None and not mission.has_stale_scores:
+        content += _evaluated(mission.scores)
+    elif isinstance(scored, Scored):
+        heads = ["", "steps compared", *(METRICS[metric] for metric in QUICK)]
+        content += table(heads, _rows(scored), numeric=range(1, len(heads)), kind="compact")
+        content += '<p class="note">cadence evaluate adds energy scores, intervals, and rivals to compare with.</p>'
+    elif scored:
+        content += f"<p>{text(scored)}</p>"
+    if isinstance(scored, Scored):
+        content += f"<h3>Motion</h3><p>{text(MOTION_WORDS)}</p>"
+        content += table(["", *MOTION.values()], _motion_rows(scored), numeric=range(1, 6), kind="compact")
+    return card("Against the truth", content, WORDS + _who(scored))
+
+
+def _who(scored: Scored | str) -> str:
+    if isinstance(scored, str) or not scored.is_matched:
+        return ""
+    return (
+        " The log does not say who was seen: in each window, agents stand for those of the truth whose positions their "
+        "detections fit best."
     )
-    return card("Against truth", content, lead)
 
 
-def _score_row(name: str, score: TruthScore) -> list[str]:
-    errors = [metres(score.mean_error_m), metres(score.median_error_m)]
-    return [name, f"{score.num_steps:,}", *errors, f"{100 * score.coverage:.0f} %"]
+def _rows(scored: Scored) -> list[list[str]]:
+    return [
+        [part, f"{len(scored.errors_m(part)):,}", *(_value(metric, scored.mean(part, metric)) for metric in QUICK)]
+        for part in PARTS
+        if len(scored.errors_m(part))
+    ]
 
 
-def _scores(mission: Mission, scores: Mapping[str, Any]) -> str:
-    """Headline rows: estimator and part down, metrics across, each with its interval."""
-    if mission.has_stale_scores:
-        return "<p>scores.json belongs to other hypotheses than these; run cadence evaluate and cadence report again.</p>"
+def _motion_rows(scored: Scored) -> list[list[str]]:
+    rows = []
+    for part in PARTS:
+        values = {name: scored.mean(part, name) for name in MOTION if name.endswith("_share")}
+        values |= {name: scored.distance(part, name) for name in MOTION if name not in values}
+        rows.append([part, *(_value(name, value) for name, value in values.items())])
+    return rows
+
+
+def _evaluated(scores: Mapping[str, Any]) -> str:
+    """Rows of scores.json: estimator and part down, metrics across, each with its interval."""
     found: dict[tuple[str, str], dict[str, str]] = {}
     for row in scores.get("rows") or []:
-        if (
-            isinstance(row, dict)
-            and row.get("by") == "part"
-            and row.get("part") in ("past", "future")
-            and row.get("metric") in METRICS
-        ):
+        if isinstance(row, dict) and row.get("by") == "part" and row.get("part") in PARTS and row.get("metric") in METRICS:
             cells = found.setdefault((str(row["part"]), str(row.get("estimator"))), {})
-            cells[str(row["metric"])] = f"{_number(row.get('value'))} ({_number(row.get('low'))} to {_number(row.get('high'))})"
+            low, high = (_value(row["metric"], row.get(side)) for side in ("low", "high"))
+            cells[str(row["metric"])] = f"{_value(row['metric'], row.get('value'))} ({low} to {high})"
     rows = [
-        [label(part), text(estimator), *(text(cells.get(metric, "–")) for metric in METRICS)]
-        for (part, estimator), cells in sorted(found.items(), key=lambda item: item[0][0] != "past")
+        [label(part), text(estimator_words(estimator)), *(text(cells.get(metric, "–")) for metric in METRICS)]
+        for (part, estimator), cells in sorted(found.items(), key=lambda item: PARTS.index(item[0][0]))
     ]
     if not rows:
         return "<p>scores.json holds no row for past or future.</p>"
-    return table(["steps", "estimator", *METRICS.values()], rows, numeric=(2, 3, 4), kind="compact")
+    return table(["", "estimator", *METRICS.values()], rows, numeric=range(2, 7), kind="compact")
 
 
-def _number(value: object) -> str:
-    return f"{value:.3g}" if isinstance(value, int | float) else "–"
+def _value(metric: str, value: object) -> str:
+    if not isinstance(value, int | float) or value != value:
+        return "–"
+    if metric.startswith("coverage") or metric.endswith("_share"):
+        return f"{100 * value:.3g} %"
+    return metres(value) if metric.endswith("_m") else f"{value:.3g}"

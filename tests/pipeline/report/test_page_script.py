@@ -1,11 +1,16 @@
 """The page's script in a browser: what a person does on the page, and what the map shows then."""
 
+import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
 import pytest
+from fixtures import mission as fixture
 from fixtures.browser import Browser, NoBrowser, Page, chromium
-from fixtures.mission import GEOREFERENCED, build_mission, rename_agents
+from fixtures.mission import GEOREFERENCED, build_mission, make_uncertain, rename_agents
 
 from pipeline.progress import Progress
 from pipeline.report.stage import ReportConfig, report
@@ -208,6 +213,166 @@ def test_a_phone_shows_the_page_without_scrolling_sideways(open_page: Open) -> N
     page = open_page(width=375, height=700, is_phone=True)
     assert page.ask("document.documentElement.scrollWidth") <= page.ask("window.innerWidth") == 375
     assert page.ask("document.getElementById('map').clientWidth") > 250 and count(page, "future") > 0
+
+
+def test_a_phone_shows_everything_unfolded_without_scrolling_sideways(open_page: Open, tmp_path: Path) -> None:
+    mission = build_mission(tmp_path)
+    rename_agents(mission, {"T0": "a_ship_with_a_name_that_nobody_can_pronounce_or_wants_to_read_to_its_very_end"})
+    report(mission, ReportConfig(), Progress(quiet=True))
+    page = open_page(mission / "report.html", width=390, height=844, is_phone=True)
+    page.ask("document.querySelectorAll('details').forEach(part => { part.open = true; })")
+    assert page.ask("document.documentElement.scrollWidth") <= page.ask("window.innerWidth") == 390
+    # Nothing lies on the list of agents, and the time stands under the map.
+    bottom, top = page.ask(
+        "[document.querySelector('.panel'), document.querySelector('.moments')].map("
+        "(part, i) => i ? part.getBoundingClientRect().top : Math.max(...[...part.querySelectorAll('*')]"
+        ".filter(e => !e.closest('ul')).map(e => e.getBoundingClientRect().bottom)))"
+    )
+    assert bottom < top
+    assert page.ask(
+        "document.querySelector('.timeline').getBoundingClientRect().bottom"
+        " < document.querySelector('.panel').getBoundingClientRect().top"
+    )
+
+
+def test_every_sensor_has_a_track_that_is_seen(open_page: Open, tmp_path: Path) -> None:
+    mission = build_mission(tmp_path)
+    table, frame = read_table(mission / "poses.parquet", "poses")
+    # The name of the first sensor was written before the track of the second was drawn, in its colour.
+    column = table.schema.get_field_index("sensor_id")
+    other = table.set_column(column, table.schema.field(column), pa.array(["radar"] * table.num_rows, pa.string()))
+    y = other.schema.get_field_index("y_m")
+    other = other.set_column(y, other.schema.field(y), pc.add(other["y_m"], 150.0))
+    write_table(pa.concat_tables([table, other]).sort_by("time_ns"), mission / "poses.parquet", "poses", frame)
+    report(mission, ReportConfig(), Progress(quiet=True))
+    page = open_page(mission / "report.html")
+    for layer in LAYERS:
+        if layer != "sensors":
+            page.click(f"[data-layer={layer}]")
+    slide(page, 5)
+    assert min(count_like(page, "sensor")) > 60
+
+
+def count_like(page: Page, name: str) -> list[int]:
+    """Pixels of the map's upper and lower half that are rather the colour than white: a thin line has hardly any pure ones."""
+    return page.ask(f"""(() => {{
+      const map = document.getElementById("map"), {{ data }} = map.getContext("2d").getImageData(0, 0, map.width, map.height);
+      const wanted = getComputedStyle(document.documentElement).getPropertyValue("--{name}").trim().slice(1);
+      const [r, g, b] = [0, 2, 4].map(i => parseInt(wanted.slice(i, i + 2), 16)), counts = [0, 0];
+      for (let i = 0; i < data.length; i += 4) {{
+        const near = (255 - data[i + 1]) / (255 - g);
+        if (near > 0.4 && data[i] > data[i + 1] + 20) counts[i < data.length / 2 ? 0 : 1]++;
+      }}
+      return counts;
+    }})()""")
+
+
+def test_the_picture_of_the_whole_holds_every_band(open_page: Open) -> None:
+    page = open_page()
+    for layer in LAYERS:
+        if layer not in ("past", "future", "envelopes"):
+            page.click(f"[data-layer={layer}]")
+    page.click("#fit-all")
+    edge = """(() => {
+      const map = document.getElementById("map"), pen = map.getContext("2d"), { width: w, height: h } = map;
+      const colourful = (...side) => {
+        const { data: d } = pen.getImageData(...side);
+        for (let i = 0; i < d.length; i += 4)
+          if (Math.max(...d.slice(i, i + 3)) - Math.min(...d.slice(i, i + 3)) > 8) return true;
+        return false;
+      };
+      return [[0, 0, w, h], [0, 0, w, 1], [0, h - 1, w, 1], [0, 0, 1, h], [w - 1, 0, 1, h]].map(side => colourful(...side));
+    })()"""
+    for window in range(6):
+        slide(page, window)
+        assert page.ask(edge) == [True, False, False, False, False], window
+
+
+def test_no_band_and_no_mean_on_an_island_that_is_passed_on_either_side(open_page: Open, tmp_path: Path) -> None:
+    mission = build_mission(tmp_path)
+    around_an_island(mission)
+    report(mission, ReportConfig(), Progress(quiet=True))
+    page = open_page(mission / "report.html")
+    page.click("#fit-window")
+    whole = island(page)
+    assert whole == {"grey"}
+    assert "50 % north" in (text(page, ".moments"))
+    for layer in ("envelopes", "mean", "past", "future"):
+        page.click(f"[data-layer={layer}]")
+    assert island(page) == {"grey"}
+
+
+def around_an_island(mission: Path) -> None:
+    """Every hypothesis passes a circle in the middle of its way, the odd ones north of it, the even ones south."""
+    table, frame = read_table(mission / "hypotheses.parquet", "hypotheses")
+    rows = table.to_pylist()
+    steps = np.arange(96)
+    bump = np.clip(1 - np.abs(steps - 40) / 15, 0, 1)
+    for row in rows:
+        side = 1 if row["hypothesis"] % 2 else -1
+        away = side * (70 + 0.5 * row["hypothesis"]) * bump
+        row |= {"weight": 1 / 12, "datum_x_m": 0.0, "datum_y_m": 0.0}
+        row["position_m"] = np.column_stack([5.0 * steps, away]).tolist()
+    write_table(pa.Table.from_pylist(rows, schema=table.schema), mission / "hypotheses.parquet", "hypotheses", frame)
+    island = {"kind": "circle", "x_m": 200.0, "y_m": 0.0, "radius_m": 40.0}
+    (mission / "obstacles.json").write_text(json.dumps({"version": 1, "obstacles": [island]}))
+
+
+def island(page: Page) -> set[str]:
+    """What colours are seen along the middle of the island, of which the map's readout tells the place."""
+    page.ask("document.getElementById('map').scrollIntoView({ block: 'center' })")
+    x, y = page.middle("#map")
+    page.mouse("mouseMoved", x, y)
+    first = place(page)
+    page.mouse("mouseMoved", x + 100, y)
+    pixel_per_m = 100 / (place(page)[0] - first[0])
+    at = x + (200 - first[0]) * pixel_per_m, y + (first[1] - 0) * pixel_per_m
+    return set(
+        page.ask(f"""(() => {{
+          const map = document.getElementById("map"), box = map.getBoundingClientRect(), pen = map.getContext("2d");
+          const reach = Math.floor(30 * {pixel_per_m});
+          const {{ data }} = pen.getImageData({at[0]} - box.left - reach, {at[1]} - box.top - reach / 2, 2 * reach, reach);
+          const found = new Set();
+          for (let i = 0; i < data.length; i += 4)
+            found.add(Math.max(...data.slice(i, i + 3)) - Math.min(...data.slice(i, i + 3)) < 12 ? "grey" : "colour");
+          return [...found];
+        }})()""")
+    )
+
+
+def test_of_many_agents_some_are_listed_and_any_is_found(
+    open_page: Open, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(fixture, "AGENT_IDS", tuple(f"ship {number:03}" for number in range(70)))
+    monkeypatch.setattr(fixture, "NUM_HYPOTHESES", 2)
+    mission = build_mission(tmp_path, num_hypotheses=2)
+    report(mission, ReportConfig(), Progress(quiet=True))
+    page = open_page(mission / "report.html")
+    listed = "[...document.querySelectorAll('#agents li')].filter(item => item.offsetParent).length"
+    assert page.ask(listed) == 60 and "60 of 70 agents listed" in text(page, "#agent-count")
+    page.ask("(b => { b.value = '069'; b.dispatchEvent(new Event('input')); })(document.getElementById('search'))")
+    assert page.ask(listed) == 1 and "1 of 70 agents" in text(page, "#agent-count")
+    page.click("#none")
+    assert count(page, "past") == 0
+    page.click("#agents li:nth-child(70) button")
+    assert count(page, "past") > 0
+    few = open_page()
+    assert few.ask("document.getElementById('search').offsetParent") is None
+
+
+def test_an_agent_is_drawn_as_strongly_as_it_is_likely(open_page: Open, tmp_path: Path) -> None:
+    mission = build_mission(tmp_path)
+    make_uncertain(mission, {"T0": 0.3, "T1": 0.999})
+    report(mission, ReportConfig(), Progress(quiet=True))
+    page = open_page(mission / "report.html")
+    assert page.ask("[...document.querySelectorAll('#agents input')].map(box => box.checked)") == [False, True]
+    assert text(page, "#agents li:nth-child(1) span").startswith("30 %") and "not ticked" in text(page, ".panel")
+    page.click("#agents li:nth-child(2) input")
+    assert count(page, "past") == 0
+    page.click("#agents li:nth-child(1) input")
+    assert count(page, "past") == 0  # faint: none of its pixels has the full colour
+    page.click("#agents li:nth-child(2) input")
+    assert count(page, "past") > 0
 
 
 def test_dark_mode_and_paper(open_page: Open) -> None:

@@ -146,7 +146,7 @@ def test_what_a_log_names_itself_stays_text(mission: Path) -> None:
 
 
 def test_the_map_holds_the_positions_that_were_drawn(mission: Path) -> None:
-    data = Page(make(mission, ReportConfig(max_vertices=7))).data
+    data = Page(make(mission, ReportConfig(max_vertices=12))).data
     table, _ = read_table(mission / "hypotheses.parquet", "hypotheses")
     code = data["fans"]
 
@@ -154,10 +154,10 @@ def test_the_map_holds_the_positions_that_were_drawn(mission: Path) -> None:
         return np.frombuffer(base64.b64decode(code[key]), kind)
 
     assert numbers("num_hypotheses", "<i2").tolist() == [12] * 11
-    assert numbers("num_vertices", "<i2").tolist() == [7] * 11
-    step = numbers("step", "<i2").reshape(11, 7)
+    assert numbers("num_vertices", "<i2").tolist() == [12] * 11
+    step = numbers("step", "<i2").reshape(11, 12)
     assert (step[:, 0] == 0).all() and (step[:, -1] == 95).all() and (step == 63).any(axis=1).all()
-    shown = numbers("hypothesis", "<i2").reshape(11, 12, 7, 2) * numbers("scale_m", "<f4")[:, None, None, None]
+    shown = numbers("hypothesis", "<i2").reshape(11, 12, 12, 2) * numbers("scale_m", "<f4")[:, None, None, None]
     shown = shown + numbers("centre_m", "<f4").reshape(11, 1, 1, 2) + np.array(data["origin_m"])
     for fan in range(11):
         window, agent = numbers("window", "<i2")[fan], data["agents"][numbers("agent", "<i2")[fan]]
@@ -170,9 +170,9 @@ def test_the_map_holds_the_positions_that_were_drawn(mission: Path) -> None:
 
 def test_latitude_and_longitude_only_with_a_datum(tmp_path: Path) -> None:
     with_datum = Page(make(built(tmp_path / "a", frame=GEOREFERENCED)))
-    assert "datum 50.8000° N, 1.2000° W" in with_datum.text and with_datum.data["geodesy"] is not None
+    assert "zero of its metres at 50.8000° N, 1.2000° W" in with_datum.text and with_datum.data["geodesy"] is not None
     without = Page(make(built(tmp_path / "b")))
-    assert "datum" not in without.text and without.data["geodesy"] is None
+    assert "zero of its metres" not in without.text and without.data["geodesy"] is None
 
 
 def test_a_large_mission_is_thinned_to_the_cap_and_says_so(tmp_path: Path) -> None:
@@ -196,7 +196,7 @@ def test_a_mission_without_truth_poses_and_hypotheses_still_has_a_page(mission: 
     write_table(windows.set_column(column, windows.schema.field(column), status), mission / "windows.parquet", "windows", frame)
     page = Page(make(mission))
     assert "No window has hypotheses" in page.text and "12 of the 12 pairs" in page.text
-    assert "Against truth" not in page.text and page.tags.count("figure") == 0
+    assert "Against the truth" not in page.text and page.tags.count("figure") == 0
 
 
 def test_one_hypothesis_of_one_step_is_enough_for_a_page(mission: Path) -> None:
@@ -225,7 +225,7 @@ def test_an_agent_that_is_only_in_the_truth_is_no_obstacle_to_a_page(mission: Pa
     page = Page(make(mission))
     assert page.data["all_agents"] == ["T0", "T1", "T2", "T10"]
     assert "Agents 2 2 more only in the truth" in page.text
-    assert "Truth covers no step of any window." in page.text
+    assert "truth is of T10, T2, detections are of T0, T1; give both the same names" in page.text
 
 
 def test_detections_without_an_agent_are_counted_and_drawn(mission: Path) -> None:
@@ -295,7 +295,7 @@ def test_scores_of_evaluate_are_shown_unless_they_are_of_other_hypotheses(missio
         "high": None,
     }
     (mission / "scores.json").write_text(json.dumps({"rows": [row, row | {"metric": "fde_m"}]}))
-    assert "future cadence 12.3 (11 to –) – –" in Page(make(mission)).text
+    assert "future cadence 12.3 m (11 m to –) – – – –" in Page(make(mission)).text
     (mission / "evaluate.manifest.json").write_text(json.dumps({"inputs": {"hypotheses.parquet": "0" * 64}, "summary": {}}))
     assert "belongs to other hypotheses" in Page(make(mission)).text
 

@@ -12,14 +12,16 @@ from hypothesis import strategies as st
 
 from pipeline.config import read_config
 from pipeline.frames import to_geodetic
-from pipeline.report.analysis import Analyser, choose_moments, find_troubles, interpolate_truth, shape_of, truth_errors
+from pipeline.report.analysis import analyse, choose_moments, find_troubles
 from pipeline.report.charts import SpreadAxis
 from pipeline.report.clock import Clock, duration
 from pipeline.report.fans import Detail, choose_detail, choose_vertices, encode_fan
 from pipeline.report.geodesy import EXPONENTS, fit_geodesy
 from pipeline.report.lengths import metres, nice_length
 from pipeline.report.markup import as_toml, inline_json, text
-from pipeline.report.mission import Fan, Points, load_mission
+from pipeline.report.mission import Fan, load_mission
+from pipeline.report.modes import strands_of
+from pipeline.report.shapes import shape_of, spread_at
 from pipeline.tables import Frame
 
 SECOND = 1_000_000_000
@@ -76,60 +78,18 @@ def test_hypotheses_in_one_point_have_an_envelope_of_one_point() -> None:
     assert np.isfinite(shape.radius).all() and (shape.axes_m * shape.radius[1][:, None] < 1e-9).all()
 
 
-def test_truth_between_its_points_and_not_in_its_gaps() -> None:
-    time_ns = np.array([0, 10, 20, 100]) * SECOND
-    truth = Points(time_ns, np.zeros(4, np.int64), np.array([[0.0, 0], [10, 0], [10, 10], [90, 10]]))
-    found = interpolate_truth(truth, np.array([-1, 0, 5, 15, 20, 50, 100, 101]) * SECOND)
-    # the gap of 80 s is over three times the median of 10 s; its two ends are known
-    expected = [[np.nan] * 2, [0, 0], [5, 0], [10, 5], [10, 10], [np.nan] * 2, [90, 10], [np.nan] * 2]
-    np.testing.assert_allclose(found, expected)
-    assert np.isnan(interpolate_truth(truth.between(0, 0), time_ns)).all()
-
-
-def test_errors_against_truth_by_hand() -> None:
-    fan = fan_of(np.array([[[0.0, 3], [10, 0]], [[0, 5], [-10, 0]]]))
-    truth = Points(np.array([100, 101]) * SECOND, np.zeros(2, np.int64), np.array([[0.0, 0], [9, 0]]))
-    errors, held = truth_errors(fan, shape_of(fan), truth)
-    assert errors == pytest.approx([4, 9]) and held.tolist() == [False, True]
-
-
-def test_hypotheses_that_are_the_truth_score_without_error(tmp_path) -> None:
-    mission = load_mission(build_mission(tmp_path))
-    analyser = Analyser(mission)
-    for fan in mission.fans:
-        exact = interpolate_truth(mission.truth.of(fan.agent), fan.time_ns)
-        copies = np.broadcast_to(np.nan_to_num(exact - fan.datum_m), (2, *exact.shape))
-        fan = Fan(
-            fan.window,
-            fan.agent,
-            fan.origin_ns,
-            fan.step_ns,
-            fan.origin_index,
-            np.full(2, 0.5),
-            fan.datum_m,
-            copies.astype(np.float32),
-        )
-        analyser.add(fan, shape_of(fan))
-    found = analyser.result()
-    assert found.past.mean_error_m < 1e-3 and found.future.mean_error_m < 1e-3
-    # Steps before an agent's first detection in the window are not compared.
-    firsts = [mission.detections.of(fan.agent).between(int(fan.time_ns[0]), fan.origin_ns).time_ns[0] for fan in mission.fans]
-    steps = sum(
-        int((fan.time_ns[: fan.origin_index + 1] >= first).sum()) for fan, first in zip(mission.fans, firsts, strict=True)
-    )
-    assert found.past.num_steps == steps
+def test_spread_at_some_steps_is_that_of_the_shape() -> None:
+    fan = fan_of(np.random.default_rng(1).normal(0, 50, (9, 5, 2)), np.random.default_rng(2).dirichlet(np.ones(9)))
+    assert spread_at(fan, [0, -1]) == pytest.approx(shape_of(fan).spread_m[[0, -1]], rel=1e-6)
 
 
 def test_moments_are_few_ordered_and_named(tmp_path) -> None:
     mission = load_mission(build_mission(tmp_path))
-    analyser = Analyser(mission)
-    for fan in mission.fans:
-        analyser.add(fan, shape_of(fan))
-    analysis = analyser.result()
+    analysis = analyse(mission, "", lambda _: None)
     moments = choose_moments(mission, analysis, 4)
     origins = [mission.fans[moment.fan].origin_ns for moment in moments]
     assert len(moments) == 4 and origins == sorted(origins)
-    widest = next(moment for moment in moments if "idest at the origin" in moment.reason)
+    widest = next(moment for moment in moments if "idest at its moment" in moment.reason)
     assert analysis.spread_now_m[widest.fan] == analysis.spread_now_m.max()
     assert choose_moments(mission, analysis, 0) == ()
 
@@ -148,16 +108,17 @@ def test_troubles_are_runs_of_neighbours(tmp_path) -> None:
 
 def test_vertices_follow_a_corner_exactly() -> None:
     corner = np.concatenate([np.stack([np.arange(10), np.zeros(10)], 1), np.stack([np.full(9, 9), np.arange(1, 10)], 1)])
-    chosen = choose_vertices(corner[None].astype(float), 4, 4)
+    chosen = choose_vertices(corner[None].astype(float), [4], 4)
     assert chosen.tolist() == [0, 4, 9, 18]
-    assert choose_vertices(corner[None].astype(float), 4, 40).tolist() == list(range(19))
-    assert len(set(choose_vertices(np.zeros((1, 19, 2)), 18, 5).tolist())) == 5
+    assert choose_vertices(corner[None].astype(float), [4], 40).tolist() == list(range(19))
+    assert len(set(choose_vertices(np.zeros((1, 19, 2)), [18], 5).tolist())) == 5
 
 
 def test_encoding_survives_one_wild_hypothesis() -> None:
     track = np.zeros((2, 5, 2))
     track[1] = 1e6
-    code = encode_fan(fan_of(track), shape_of(fan_of(track)), Detail(1, 1, 2, 5))
+    fan = fan_of(track)
+    code = encode_fan(fan, strands_of(fan, shape_of(fan), None), Detail(1, 1, 2, 5))
     assert np.abs(code.hypothesis * code.scale_m + code.centre_m - track).max() <= code.scale_m
     assert (np.abs(code.summary.astype(int)) <= 32_000).all()
 
@@ -212,7 +173,8 @@ def test_times_and_lengths_for_people() -> None:
         "1 d",
         "3 d 05 h",
     ]
-    assert [metres(x) for x in (0.01234, 12.34, 999.4, 999.6, 12_345, 1_234_567)] == [
+    assert [metres(x) for x in (0.00123, 0.01234, 12.34, 999.4, 999.6, 12_345, 1_234_567)] == [
+        "under 1 cm",
         "0.0123 m",
         "12.3 m",
         "999 m",
