@@ -119,7 +119,7 @@ def theirs(path: Path) -> dict[str, Callable[[], int]]:
 
 def ours(path: Path) -> dict[str, tuple[str, Callable[[], int]]]:
     """What we are asked to do, and to which of `theirs` it is compared."""
-    from pipeline.extract.positions import ChannelReader
+    from pipeline.extract.channel_reader import ChannelReader
     from pipeline.extract.reading import read_positions
     from pipeline.logs.cdr_fields import CdrFields
     from pipeline.logs.decode import decoder_for

@@ -24,13 +24,13 @@ from pipeline.extract.stage import ExtractConfig, write_tables
 from pipeline.logs.reader import open_log
 from pipeline.mapping.sources import SourceConfig
 from pipeline.progress import Progress
-from pipeline.suspicions import Kind
+from pipeline.suspicions import LogKind
 
 SIZE_MB = 100.0
 NUM_POSITIONS = 200_000
 NUM_TARGETS = 20
 SHIPS = Path(__file__).resolve().parents[2] / "shared" / "data" / "maritime" / "solent_ais_known.mcap"
-EVERY_KIND: tuple[Kind, ...] = get_args(Kind)
+EVERY_KIND: tuple[LogKind, ...] = get_args(LogKind)
 
 
 def write_positions(path: Path, num_positions: int) -> None:

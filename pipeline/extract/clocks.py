@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 
 from cadence.arrays import Bools, Float64s, Int64s, Objects
-from pipeline.extract.positions import numbered
+from pipeline.extract.positions import Names
 
 AHEAD_S: Final = 2.0
 """A message cannot be logged before the moment it tells of, and the clocks of one vehicle agree better than this."""
@@ -176,7 +176,7 @@ def _standing(stamps: Stamps) -> tuple[Bools, str]:
     """
     order, is_next = np.arange(len(stamps)), np.ones(len(stamps) - 1, np.bool_)
     if len(stamps.who):
-        who = numbered(stamps.who)
+        who = Names.of(stamps.who).number
         order = np.argsort(who, kind="stable")
         is_next = who[order][1:] == who[order][:-1]
     step_s = np.diff(stamps.time_ns[order]).astype(np.float64) * 1e-9

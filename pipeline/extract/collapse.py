@@ -6,7 +6,7 @@ without time passing, and count as often as there are sensors.
 
 import itertools
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -51,7 +51,7 @@ def collapse(positions: Positions, tolerance_s: float) -> Collapsed:
         heights = positions.z_m[group]
         z_m[kept] = heights[np.isfinite(heights)].mean() if np.isfinite(heights).any() else np.nan
         sensor[kept] = "+".join(sorted({name for name in positions.sensor[group] if name is not None})) or None
-    merged = replace(positions, first=first, second=second, z_m=z_m, covariance_m2=covariance, sensor=sensor)
+    merged = positions.changed(first=first, second=second, z_m=z_m, covariance_m2=covariance, sensor=sensor)
     return Collapsed(merged[is_kept], num_merged[is_kept], num_disagreeing)
 
 

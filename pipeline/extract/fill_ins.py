@@ -27,10 +27,8 @@ def without_fill_ins(rows: Positions, role: str, suspicions: Suspicions) -> Posi
     if len(rows) == 0 or not suspicions.looks_for("place"):
         return rows
     is_fill_in = np.zeros(len(rows), np.bool_)
-    for first, second in (*_FILL_INS, *_repeated(rows)):
+    for first, second in _candidates(rows):
         is_value = (rows.first == first) & (rows.second == second)
-        if not is_value.any():
-            continue
         for of_agent in _by_agent(rows, is_value):
             is_alone = bool(is_value[of_agent].all())
             if is_alone and rows.is_geodetic[0] and (first, second) in _FILL_INS:
@@ -50,13 +48,18 @@ def without_fill_ins(rows: Positions, role: str, suspicions: Suspicions) -> Posi
     return rows[~is_fill_in]
 
 
-def _repeated(rows: Positions) -> list[tuple[float, float]]:
-    """Places of several rows that look written rather than measured: a coordinate is zero, or both are alike but for a sign."""
-    is_odd = (rows.first == 0) | (rows.second == 0) | (np.abs(rows.first) == np.abs(rows.second))
-    is_odd &= np.where(rows.is_geodetic, np.abs(rows.first) <= _MAX_LATITUDE_DEG, np.isfinite(rows.first))  # others are lost
+def _candidates(rows: Positions) -> list[tuple[float, float]]:
+    """Places of rows that may be fill-ins: known ones, and such as several rows have that look written rather than measured.
+
+    There a coordinate is zero, or both are alike but for a sign.
+    """
+    size = np.abs(rows.first)
+    is_odd = (size == 0) | (rows.second == 0) | (size == np.abs(rows.second)) | (size == _MAX_LATITUDE_DEG)
+    is_odd &= np.where(rows.is_geodetic, size <= _MAX_LATITUDE_DEG, np.isfinite(size))  # others are lost anyway
     counts = Counter(zip(rows.first[is_odd].tolist(), rows.second[is_odd].tolist(), strict=True))
-    chosen = [place for place, count in counts.items() if count >= _MIN_REPEATS and place not in _FILL_INS]
-    return chosen if len(chosen) <= _MAX_PLACES else []
+    known = [place for place in counts if place in _FILL_INS]
+    written = [place for place, count in counts.items() if count >= _MIN_REPEATS and place not in known]
+    return known + (written if len(written) <= _MAX_PLACES else [])
 
 
 def _by_agent(rows: Positions, is_value: Bools) -> Iterator[Bools]:

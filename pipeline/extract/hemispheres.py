@@ -8,7 +8,8 @@ from typing import Final, Literal
 
 import numpy as np
 
-from pipeline.extract.positions import ChannelReader, Positions
+from pipeline.extract.channel_reader import ChannelReader
+from pipeline.extract.positions import Positions
 from pipeline.suspicions import Suspicions
 
 Mirrored = Literal["exchanged", "other side of Greenwich", "other side of the equator", "other side of both"]

@@ -68,7 +68,7 @@ def check_joined(
 
 
 def _metric_frames(rows: Positions) -> set[str]:
-    return {str(name) for name in set(rows.frame_id[~rows.is_geodetic])}
+    return {rows.frames.names[number] for number in np.unique(rows.frames.number[~rows.is_geodetic]).tolist()}
 
 
 def _mover(poses: Positions, names: Collection[str]) -> str:

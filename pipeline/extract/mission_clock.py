@@ -5,13 +5,13 @@ told as a suspicion.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 
 import numpy as np
 
 from cadence.arrays import Bools, Int64s
+from pipeline.extract.channel_reader import ChannelReader
 from pipeline.extract.clocks import MIN_ROWS, Clock, Judgement, Stamps, judge, strays
-from pipeline.extract.positions import ChannelReader, Positions
+from pipeline.extract.positions import Positions
 from pipeline.mapping.sources import LOG_TIME, PUBLISH_TIME
 from pipeline.suspicions import Suspicions
 
@@ -74,6 +74,6 @@ def on_one_clock(
             return rows
         setting = f'time = "log_time" in its [[extract.{role}]], or '
         time_ns, is_kept = mission.mended(reader.channel.topic, *judged[id(reader)], setting)
-        return replace(rows, time_ns=time_ns)[is_kept]
+        return rows.changed(time_ns=time_ns)[is_kept]
 
     return {role: [mended(role, *pair) for pair in found] for role, found in parts.items()}, mission

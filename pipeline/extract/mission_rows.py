@@ -3,12 +3,12 @@
 import itertools
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
 
 from cadence.errors import InputError, NothingDetectedError
+from pipeline.extract.channel_reader import ChannelReader
 from pipeline.extract.config import ExtractConfig
 from pipeline.extract.fill_ins import without_fill_ins
 from pipeline.extract.hemispheres import check_hemispheres
@@ -16,7 +16,7 @@ from pipeline.extract.joined import check_joined
 from pipeline.extract.mission_clock import on_one_clock
 from pipeline.extract.names import Naming, without_false_names
 from pipeline.extract.placement import Placing, bring_together, datum_of_transforms, in_enu, mission_frame, place
-from pipeline.extract.positions import ChannelReader, Positions, Rows
+from pipeline.extract.positions import Positions, Rows
 from pipeline.extract.reuse import without_reused_names
 from pipeline.extract.selection import ROLES
 from pipeline.extract.spikes import is_spike
@@ -94,7 +94,7 @@ def _numbered(parts: Sequence[tuple[ChannelReader, Positions]]) -> list[tuple[Ch
     """The rows of each reader, with numbers of messages that no other reader has."""
     sizes = [int(part.message.max(initial=0)) for _, part in parts]
     return [
-        (reader, replace(part, message=part.message + before))
+        (reader, part.changed(message=part.message + before))
         for (reader, part), before in zip(parts, itertools.accumulate(sizes, initial=0), strict=False)
     ]
 
@@ -180,4 +180,4 @@ def _thinned(rows: Positions, config: ThinningConfig) -> Positions:
     covariance = rows.covariance_m2
     if config.variance_m2 > 0:
         covariance = np.nan_to_num(covariance, nan=0.0) + np.array([config.variance_m2, 0.0, config.variance_m2])
-    return replace(rows, first=first, second=second, covariance_m2=covariance)[is_kept]
+    return rows.changed(first=first, second=second, covariance_m2=covariance)[is_kept]

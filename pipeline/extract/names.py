@@ -5,13 +5,13 @@ A name is believed as long as nothing contradicts it. What does, is said as a su
 
 import itertools
 from collections.abc import Collection, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from cadence.arrays import Bools, Int64s
+from cadence.arrays import Bools, Int64s, Objects
 from pipeline.extract.covariances import are_apart
 from pipeline.extract.positions import Positions
 from pipeline.suspicions import Suspicions, listed
@@ -56,15 +56,16 @@ def without_false_names(rows: Positions, tolerance_s: float, naming: Naming, sus
     if not suspicions.looks_for("identity"):
         return rows
     rows = _without_shared(rows, naming, round(tolerance_s * 1e9), suspicions)
-    agent = rows.agent.copy()
+    agent: Objects | None = None
     for topic, of_topic in zip(rows.topics.names, rows.topics.rows(), strict=True):
         if topic in naming.believed or topic in naming.topical:
             continue
         chosen = of_topic[rows.agents.number[of_topic] >= 0]
         for is_false, seen in _faults(rows[chosen], topic in naming.stated):
+            agent = rows.agent.copy() if agent is None else agent
             agent[chosen[is_false]] = None
             _suspect(topic, seen, int(is_false.sum()), suspicions)
-    return rows if (agent == rows.agent).all() else replace(rows, agent=agent)
+    return rows if agent is None else rows.changed(agent=agent)
 
 
 def _faults(rows: Positions, is_stated: bool) -> Iterator[tuple[Bools, str]]:
@@ -133,7 +134,7 @@ def _without_shared(rows: Positions, naming: Naming, tolerance_ns: int, suspicio
         names = listed([rows.agents.names[number] for number in numbers])
         seen = f"{_num_messages(rows, shared)} of {_num_messages(rows, of_topic)} messages have {names} at several places"
         _suspect(topic, seen, int(is_false.sum()), suspicions)
-    return replace(rows, agent=agent)
+    return rows.changed(agent=agent)
 
 
 def _num_messages(rows: Positions, chosen: Int64s) -> int:

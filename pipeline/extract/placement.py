@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -132,14 +132,14 @@ def place(positions: Positions, frame: Frame) -> tuple[Positions, int]:
     """The rows that can be given in `frame`, with first and second its x_m and y_m; and how many cannot."""
     if len(positions) == 0:
         return positions, 0
-    is_same = np.isin(positions.frame_id.astype(np.str_), (frame.frame_id, ""))
+    is_same = np.array([name in (frame.frame_id, "") for name in positions.frames.names])[positions.frames.number]
     is_placed = np.where(positions.is_geodetic, frame.is_georeferenced, is_same)
     placed = positions[is_placed]
     first, second = placed.first.copy(), placed.second.copy()
     rows = placed.is_geodetic
     if rows.any():
         first[rows], second[rows] = to_local(frame, placed.first[rows], placed.second[rows])
-    return replace(placed, first=first, second=second, is_geodetic=np.zeros_like(rows)), int((~is_placed).sum())
+    return placed.changed(first=first, second=second, is_geodetic=np.zeros_like(rows)), int((~is_placed).sum())
 
 
 def in_enu(positions: Positions) -> Positions:
@@ -150,7 +150,7 @@ def in_enu(positions: Positions) -> Positions:
     turned = _turned(positions, rows, np.broadcast_to(_NED_TO_ENU, (int(rows.sum()), 3, 3)), np.zeros(3))
     frame_id = positions.frame_id.copy()
     frame_id[rows] = [f"{name}_enu" if name else "" for name in frame_id[rows]]
-    return replace(turned, frame_id=frame_id)
+    return turned.changed(frame_id=frame_id)
 
 
 def _moved(positions: Positions, target: str, tree: TransformTree, limits: Limits, counts: Counter[str]) -> Positions:
@@ -166,7 +166,7 @@ def _moved(positions: Positions, target: str, tree: TransformTree, limits: Limit
         is_kept[rows] = motion.is_known
         counts["transformed"] += int(motion.is_known.sum())
         counts["no_transform"] += int((~motion.is_known).sum())
-    return replace(positions, frame_id=frame_id)[is_kept]
+    return positions.changed(frame_id=frame_id)[is_kept]
 
 
 def _turned(positions: Positions, rows: np.ndarray, rotation: np.ndarray, translation_m: np.ndarray) -> Positions:
@@ -182,14 +182,13 @@ def _turned(positions: Positions, rows: np.ndarray, rotation: np.ndarray, transl
     full = np.concatenate([columns["covariance_m2"][rows], columns["height_covariance_m2"][rows]], axis=1)
     full = rotated(full, rotation)
     columns["covariance_m2"][rows], columns["height_covariance_m2"][rows] = full[:, :3], full[:, 3:]
-    return replace(positions, **columns)
+    return positions.changed(**columns)
 
 
 def _frames(positions: Positions) -> set[tuple[str, bool]]:
     """(frame id, is geodetic) of metric and geodetic rows; metric rows without a frame id are taken to be in the others'."""
-    found = {
-        (str(name), bool(is_geodetic)) for name, is_geodetic in zip(positions.frame_id, positions.is_geodetic, strict=True)
-    }
+    kinds = np.unique(2 * positions.frames.number + positions.is_geodetic).tolist()
+    found = {(positions.frames.names[kind // 2], bool(kind % 2)) for kind in kinds}
     is_named = any(name and not is_geodetic for name, is_geodetic in found)
     return {(name, is_geodetic) for name, is_geodetic in found if is_geodetic or name or not is_named}
 

@@ -6,7 +6,7 @@ from typing import Final
 
 import numpy as np
 
-from pipeline.extract.positions import ChannelReader
+from pipeline.extract.channel_reader import ChannelReader
 from pipeline.logs.channels import Batch
 from pipeline.logs.decode import UndecodableChannel, UndecodableMessage, decoder_for, with_definition
 from pipeline.logs.reader import Channel, MissionLog, RawMessage

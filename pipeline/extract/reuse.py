@@ -5,14 +5,14 @@ A small number that a tracker gives out anew, sensors that count for themselves,
 
 from collections import defaultdict
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
 
 from cadence.arrays import Int64s, Objects
 from pipeline.extract.names import Naming
-from pipeline.extract.positions import Names, Positions
+from pipeline.extract.positions import Positions
 from pipeline.extract.tracks import Jump, Track, apart_m, odd_share, pieces_of
 from pipeline.suspicions import Suspicions, listed
 
@@ -44,8 +44,8 @@ def without_reused_names(rows: Positions, tolerance_s: float, naming: Naming, su
     """
     if not suspicions.looks_for("identity") or len(rows) == 0:
         return rows
-    agent, found = rows.agent.copy(), defaultdict[str, _Found](_Found)
-    track, taken, sensors = _track(rows), set(rows.agents.names), Names.of(rows.sensor)
+    agent, found = rows.agent, defaultdict[str, _Found](_Found)
+    track, taken, sensors = _track(rows), set(rows.agents.names), rows.sensors
     sources = rows.topics.number * (len(sensors.names) + 1) + sensors.number
     is_believed = np.array([topic in naming.believed for topic in rows.topics.names])[rows.topics.number]
     for name, chosen in zip(rows.agents.names, rows.agents.rows(), strict=True):
@@ -57,12 +57,14 @@ def without_reused_names(rows: Positions, tolerance_s: float, naming: Naming, su
         for part_name, same in _apart(track, name, named, told).items():
             renamed = _renamed(track, part_name, same, tolerance_s, taken, told)
             if renamed is not None:
+                agent = agent.copy() if agent is rows.agent else agent
                 agent[np.sort(np.concatenate(same))] = renamed
             elif part_name != name:
+                agent = agent.copy() if agent is rows.agent else agent
                 agent[np.concatenate(same)] = part_name
     for topics, told in found.items():
         _tell(topics, told, suspicions)
-    return replace(rows, agent=agent) if any(told.any() for told in found.values()) else rows
+    return rows.changed(agent=agent) if any(told.any() for told in found.values()) else rows
 
 
 def _track(rows: Positions) -> Track:

@@ -6,13 +6,13 @@ must be one target's: of several, each row would fit far better between some two
 """
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
 from cadence.arrays import Float64s, Int64s
-from pipeline.extract.positions import Positions, numbered
+from pipeline.extract.positions import Positions
 from pipeline.suspicions import Suspicions
 
 _NEIGHBOURS: Final = (-2, -1, 1, 2)
@@ -58,7 +58,7 @@ def with_scatter(
     """
     found: dict[str, float] = {}
     covariance = rows.covariance_m2.copy()
-    topics, agents = numbered(rows.topic), numbered(rows.agent)
+    topics, agents = rows.topics.number, rows.agents.number
     for number in range(int(topics.max(initial=-1)) + 1):
         of_topic = topics == number
         topic = str(rows.topic[of_topic.argmax()])
@@ -72,7 +72,7 @@ def with_scatter(
         if scatter.is_noise and is_open.any() and not has_default:
             covariance[is_open] = scatter.sigma_m**2 * np.array([1.0, 0.0, 1.0])
             found[topic] = scatter.sigma_m
-    return replace(rows, covariance_m2=covariance), found
+    return rows.changed(covariance_m2=covariance), found
 
 
 def _is_contradicted(topic: str, covariance_m2: Float64s, scatter: Scatter, suspicions: Suspicions) -> bool:

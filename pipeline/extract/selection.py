@@ -4,7 +4,7 @@ import fnmatch
 from collections.abc import Mapping, Sequence
 
 from cadence.errors import ConfigError, InputError, NothingDetectedError
-from pipeline.extract.positions import ChannelReader
+from pipeline.extract.channel_reader import ChannelReader
 from pipeline.extract.thinning import ThinningConfig
 from pipeline.logs.reader import Channel
 from pipeline.mapping.guess import SuggestedMapping, dense_sources, describe_channels, suggest_mapping, usable_type

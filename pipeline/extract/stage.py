@@ -5,7 +5,6 @@ Decoded messages become rows in the mission frame, sorted by time; whatever is l
 
 import contextlib
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +12,12 @@ import numpy as np
 
 from cadence.errors import ConfigError, ImplausibleInputError, InputError
 from pipeline.catalogue import open_catalogued_log, read_catalogue
+from pipeline.extract.channel_reader import ChannelReader
 from pipeline.extract.collapse import Collapsed, collapse
 from pipeline.extract.config import ExtractConfig
 from pipeline.extract.mission_rows import rows_in_frame
 from pipeline.extract.obstacle_sources import collect_obstacles
-from pipeline.extract.positions import ChannelReader, Positions
+from pipeline.extract.positions import Positions
 from pipeline.extract.reading import read_positions
 from pipeline.extract.scatter import with_scatter
 from pipeline.extract.selection import select_readers, selected_channels, unused_channels
@@ -143,7 +143,7 @@ def _with_accuracy(
         return rows, found
     covariance = rows.covariance_m2.copy()
     covariance[np.isnan(covariance[:, 0])] = config.default_sigma_m**2 * np.array([1.0, 0.0, 1.0])
-    return replace(rows, covariance_m2=covariance), found
+    return rows.changed(covariance_m2=covariance), found
 
 
 def _without_repeats(rows: Positions) -> tuple[Positions, int]:

@@ -7,8 +7,9 @@ from typing import Final
 import numpy as np
 
 from cadence.arrays import Int64s
+from pipeline.extract.channel_reader import ChannelReader
 from pipeline.extract.mission_clock import TRUSTED
-from pipeline.extract.positions import ChannelReader, Positions
+from pipeline.extract.positions import Positions
 from pipeline.logs.health import utc
 from pipeline.suspicions import Suspicions
 

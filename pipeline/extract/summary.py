@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.extract.positions import ChannelReader, Positions
+from pipeline.extract.channel_reader import ChannelReader
+from pipeline.extract.positions import Positions
 from pipeline.extract.selection import ROLES
 from pipeline.logs.reader import MissionLog
 from pipeline.mapping.message_types import MESSAGE_TYPES, type_of_schema

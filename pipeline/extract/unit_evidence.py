@@ -1,13 +1,13 @@
 """In which unit positions can be meant, by their range and by how fast they would move in it."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final, Literal
 
 import numpy as np
 
 from cadence.arrays import Bools, Float64s
-from pipeline.extract.positions import Positions, numbered
+from pipeline.extract.positions import Positions
 from pipeline.frames import DEGREE_M, EARTH_CENTRED
 from pipeline.mapping.sources import Unit
 
@@ -74,7 +74,7 @@ TO_DEGREES: Final[Mapping[Unit, Callable[[Float64s], Float64s]]] = {
 
 def in_degrees(rows: Positions, unit: Unit) -> Positions:
     """The rows, whose latitudes and longitudes are in `unit`, in degrees."""
-    return replace(rows, first=TO_DEGREES[unit](rows.first), second=TO_DEGREES[unit](rows.second))
+    return rows.changed(first=TO_DEGREES[unit](rows.first), second=TO_DEGREES[unit](rows.second))
 
 
 def of_degrees(rows: Positions) -> Evidence | None:
@@ -107,8 +107,8 @@ def of_metres(rows: Positions) -> Evidence | None:
 
 def are_earth_centred(rows: Positions) -> Bools:
     """Which rows [N] are in a frame that is at the centre of the earth by its name."""
-    named = [name for name in set(rows.frame_id) if str(name).rpartition("/")[2].lower() in EARTH_CENTRED]
-    return np.isin(rows.frame_id.astype(np.str_), named) if named else np.zeros(len(rows), np.bool_)
+    are_named = [name.rpartition("/")[2].lower() in EARTH_CENTRED for name in rows.frames.names]
+    return np.array(are_named)[rows.frames.number] if any(are_named) else np.zeros(len(rows), np.bool_)
 
 
 def _of_whole_numbers(rows: Positions, seen: str) -> Evidence | None:
@@ -217,7 +217,7 @@ def _is_straight(rows: Positions, way_m: float) -> bool:
 
 def _progress_mps(rows: Positions) -> float:
     """How fast the target with most rows gets on over half of its rows; 0 where that cannot be said."""
-    agent = numbered(rows.agent)
+    agent = rows.agents.number
     if (agent < 0).any():
         return 0.0
     track = np.flatnonzero(agent == np.bincount(agent).argmax())
@@ -234,7 +234,7 @@ def _speed_mps(rows: Positions, unit_m: float) -> float | None:
     """Median speed between successive rows of an agent; None where rows without a name are not one target's."""
     if len(rows) < 2:
         return None
-    agent = numbered(rows.agent)
+    agent = rows.agents.number
     order = np.lexsort((rows.time_ns, agent))
     scale = np.cos(np.radians(np.clip(rows.first[order], -89, 89)[1:])) if rows.is_geodetic[0] else 1.0
     step_m = unit_m * np.hypot(np.diff(rows.first[order]), scale * np.diff(rows.second[order]))

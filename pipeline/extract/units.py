@@ -4,7 +4,6 @@ A unit that a source states is taken as it is. Otherwise `unit_evidence` tells w
 suspicion.
 """
 
-from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -27,7 +26,7 @@ from pipeline.mapping.sources import SourceConfig, Unit
 from pipeline.suspicions import Suspicions
 
 _MAX_ORBIT_M: Final = 5e7
-_MAX_ROWS: Final = 4096
+_MAX_ROWS: Final = 2048
 """More rows of a source would not tell more."""
 
 
@@ -65,7 +64,7 @@ def _made(what: Made | Unit, rows: Positions) -> Positions:
         case "ecef":
             return _from_centre(rows, np.ones(len(rows), np.bool_))
         case "exchanged":
-            return replace(rows, first=rows.second, second=rows.first)
+            return rows.changed(first=rows.second, second=rows.first)
         case "left out":
             return rows[:0]
         case _:
@@ -92,4 +91,4 @@ def _from_centre(rows: Positions, is_centred: Bools) -> Positions:
     full = np.concatenate([rows.covariance_m2[is_centred], rows.height_covariance_m2[is_centred]], axis=1)
     turned = rotated(full, east_north_up(latitude, longitude))
     found["covariance_m2"][is_centred], found["height_covariance_m2"][is_centred] = turned[:, :3], turned[:, 3:]
-    return replace(rows, is_geodetic=rows.is_geodetic | is_centred, **found)
+    return rows.changed(is_geodetic=rows.is_geodetic | is_centred, **found)

@@ -14,8 +14,9 @@ from hypothesis import strategies as st
 from mcap.writer import Writer
 
 from cadence.errors import ConfigError
+from pipeline.extract.channel_reader import ChannelReader
 from pipeline.extract.covariances import stated_covariance, stated_covariances
-from pipeline.extract.positions import ChannelReader, Positions
+from pipeline.extract.positions import Positions
 from pipeline.extract.reading import read_positions
 from pipeline.logs import cdr_fields
 from pipeline.logs.decode import UndecodableChannel

@@ -10,7 +10,8 @@ from fixtures.field_messages import OBJECTS, PX4, PX4_OLD, RECEIVERS
 from fixtures.ros_messages import VISION_FOXY, VISION_HUMBLE, Builder, store_with
 from fixtures.small_logs import START_NS, Row, write_log
 
-from pipeline.extract.positions import ChannelReader, Positions
+from pipeline.extract.channel_reader import ChannelReader
+from pipeline.extract.positions import Positions
 from pipeline.extract.reading import read_positions
 from pipeline.logs.reader import open_log
 from pipeline.mapping.message_types import type_of_schema

@@ -29,7 +29,8 @@ from google.protobuf.json_format import MessageToDict
 from google.protobuf.message import Message
 from rosbags.typesys import Stores
 
-from pipeline.extract.positions import ChannelReader, Positions
+from pipeline.extract.channel_reader import ChannelReader
+from pipeline.extract.positions import Positions
 from pipeline.extract.reading import read_positions
 from pipeline.logs.reader import open_log
 from pipeline.mapping.message_types import MESSAGE_TYPES, normalise_schema, type_of_schema
