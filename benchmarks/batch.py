@@ -25,10 +25,11 @@ from pipeline.checkpoints import checkpoint_hash, find_checkpoint
 from pipeline.config import stage_config
 from pipeline.estimators.place import load_place_model, place_grid
 from pipeline.files import hash_file
+from pipeline.grids import plan_grid
 from pipeline.progress import Progress
 from pipeline.simulate.stage import SimulateConfig, simulate
 from pipeline.tables import read_table
-from pipeline.windows import build_windows, plan_grid
+from pipeline.windows import build_windows
 
 NUM_BROKEN = 5
 SIZES = (1, 2, 4, 8, 16)

@@ -32,13 +32,14 @@ from pipeline.extract.config import ExtractConfig
 from pipeline.extract.stage import extract
 from pipeline.extract.thinning import ThinningConfig
 from pipeline.files import write_atomic
+from pipeline.grids import GridConfig, plan_grid
 from pipeline.ingest.stage import IngestConfig, ingest
 from pipeline.mapping.sources import SourceConfig
 from pipeline.progress import Progress
 from pipeline.scoring.case import default_truth_gap_s
 from pipeline.scoring.scores import METRICS, PARTS, Cells, compare, groups_of
 from pipeline.tables import read_table
-from pipeline.windows import GridConfig, MissionWindows, build_windows, plan_grid, truth_on_grid
+from pipeline.windows import MissionWindows, build_windows, truth_on_grid
 
 DATA = Path(__file__).resolve().parents[1].parent / "shared" / "data"
 WORK = Path("out/benchmarks/real_logs")

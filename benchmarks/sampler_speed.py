@@ -44,9 +44,10 @@ from pipeline.checkpoints import checkpoint_hash, find_checkpoint
 from pipeline.estimators.fitting import FittingData
 from pipeline.estimators.presets import load_estimator
 from pipeline.estimators.samplings import GeneralSampling, Samplings
+from pipeline.grids import GridConfig, plan_grid
 from pipeline.infer.draws import draw_windows
 from pipeline.train.missions import mission_of_episode
-from pipeline.windows import GridConfig, MissionWindows, build_windows, plan_grid, truth_on_grid
+from pipeline.windows import MissionWindows, build_windows, truth_on_grid
 
 NUM_STEPS, ITERATIONS, LEARNING_RATE = 100, 8, 1e-2
 POOL = 64

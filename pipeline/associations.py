@@ -25,18 +25,9 @@ from cadence.errors import InputError
 from cadence.resampling import systematic
 from cadence.seeds import part_seeds
 from cadence.types import WindowBatch
+from pipeline.grids import Grid, GridConfig, plan_grid
 from pipeline.tracks import DetectionTrack, track_of
-from pipeline.windows import (
-    Grid,
-    GridConfig,
-    MissionWindows,
-    is_first_or_last,
-    kept_tracks,
-    middle_m,
-    padded_detections,
-    plan_grid,
-    window_seeds,
-)
+from pipeline.windows import MissionWindows, is_first_or_last, kept_tracks, middle_m, padded_detections, window_seeds
 from schemas.tables import ASSOCIATIONS, LABELS
 
 _LEAST_PROBABILITY = 1e-3

@@ -65,7 +65,13 @@ class RelayedProgress(Progress):
     def bar(self, total: int | None, label: str, unit: str = "it", scale: bool = False) -> "tqdm[Any]":
         """A bar that is not drawn but told."""
         self.tell(Doing(label))
-        return _ToldBar(total, lambda share: self.tell(self.begin + share * (self.end - self.begin)))
+
+        def told(done: float, share: float) -> None:
+            self.tell(self.begin + share * (self.end - self.begin))
+            if unit != "B":  # of bytes the share says enough
+                self.tell(Doing(f"{label} {done:.0f} of {total} {unit}s"))
+
+        return _ToldBar(total, told)
 
     def note(self, text: str) -> None:
         """Tell one line."""
@@ -83,7 +89,7 @@ class RelayedProgress(Progress):
 class _ToldBar(tqdm):  # type: ignore[type-arg]
     """A bar without a picture, which tells its share at each per cent."""
 
-    def __init__(self, total: int | None, tell: Callable[[float], object]) -> None:
+    def __init__(self, total: int | None, tell: Callable[[float, float], object]) -> None:
         super().__init__(total=total, disable=True)
         self._size, self._tell, self._done, self._told = total or 0, tell, 0.0, 0.0
 
@@ -92,5 +98,5 @@ class _ToldBar(tqdm):  # type: ignore[type-arg]
         share = min(self._done / self._size, 1.0) if self._size else 0.0
         if share - self._told >= _MIN_SHARE:
             self._told = share
-            self._tell(share)
+            self._tell(self._done, share)
         return None

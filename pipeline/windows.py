@@ -1,10 +1,9 @@
-"""Tables to tensors: the time grid of a mission, its windows of detections, and truth on the same grid.
+"""Tables to tensors: the windows of detections of a mission on its time grid, and truth on the same grid.
 
 Inside a window time is seconds relative to its origin and space metres relative to its datum; int64 nanoseconds and
 float64 mission coordinates end here.
 """
 
-import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
@@ -15,74 +14,9 @@ from torch import Tensor
 
 from cadence.arrays import Bools, Float64s, Int64s
 from cadence.constraints.obstacles import Obstacles
-from cadence.errors import ConfigError, InputError
 from cadence.types import Context, Detections, WindowBatch
+from pipeline.grids import Grid
 from pipeline.tracks import DetectionTrack, agent_tracks, interpolated
-
-_NICE = np.array([1.0, 1.2, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0])
-_STEPS_PER_GAP = 16.0
-
-
-@dataclass(frozen=True)
-class GridConfig:
-    """The time grid of the windows.
-
-    step_s         seconds between steps; by default a sixteenth of the gap in which a random moment of the mission lies
-    history_steps  steps up to and including the origin
-    horizon_steps  steps after it
-    stride_steps   steps from one origin to the next
-    context_steps  detections from this many steps before the origin on are used; by default from the first step on
-    """
-
-    step_s: float | None = None
-    history_steps: int = 64
-    horizon_steps: int = 32
-    stride_steps: int = 16
-    context_steps: int | None = None
-
-    def __post_init__(self) -> None:
-        if self.step_s is not None and not self.step_s > 0:
-            raise ValueError(f"step_s must be positive, got {self.step_s}")
-        if min(self.history_steps, self.stride_steps) < 1 or self.horizon_steps < 0:
-            raise ValueError("history_steps and stride_steps must be at least 1, horizon_steps at least 0")
-        if self.context_steps is not None and self.context_steps < self.history_steps:
-            raise ValueError(f"context_steps is {self.context_steps}, less than history_steps {self.history_steps}")
-
-
-@dataclass(frozen=True, eq=False)
-class Grid:
-    """Resolved grid: `origins_ns` [B] and the steps around each; detections reach back `context_steps` (None: the history)."""
-
-    step_ns: int
-    history_steps: int
-    horizon_steps: int
-    origins_ns: Int64s
-    context_steps: int | None = None
-
-    @property
-    def context_ns(self) -> int:
-        """How far before the origin detections are used."""
-        return (self.context_steps or self.history_steps) * self.step_ns
-
-    @property
-    def step_s(self) -> float:
-        """Seconds between two steps."""
-        return self.step_ns * 1e-9
-
-    @property
-    def num_steps(self) -> int:
-        """Number of steps T of a window."""
-        return self.history_steps + self.horizon_steps
-
-    @property
-    def origin_index(self) -> int:
-        """Index of the step at the origin, the last of the history."""
-        return self.history_steps - 1
-
-    @property
-    def time_s(self) -> Tensor:
-        """Step times relative to the origin [T], float64."""
-        return (torch.arange(self.num_steps, dtype=torch.float64) - self.origin_index) * self.step_s
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,39 +37,6 @@ class MissionWindows:
         elapsed_s = torch.from_numpy((self.origins_ns - start_ns).astype(np.float64) * 1e-9).clamp_min(0.0)
         context = Context(torch.from_numpy(self.datum_m), elapsed_s, obstacles=obstacles)
         return replace(self, batch=self.batch.with_context(context))
-
-
-def plan_grid(detections: pa.Table, config: GridConfig) -> Grid:
-    """The grid for a DETECTIONS table: the step from the gaps unless configured, origins from first to last detection."""
-    if detections.num_rows == 0:
-        raise InputError("detections: the table is empty; nothing was detected, so there is nothing to infer from")
-    times = _times_by_agent(detections)
-    step_s = config.step_s if config.step_s is not None else suggest_step_s(times)
-    step_ns = max(1, round(step_s * 1e9))
-    first, last = min(int(t[0]) for t in times), max(int(t[-1]) for t in times)
-    stride_ns = config.stride_steps * step_ns
-    num_windows = max(1, math.ceil((last - first) / stride_ns))
-    if num_windows > 1_000_000:
-        raise ConfigError(f"infer.grid: {num_windows} windows of step {step_s:g} s; choose a larger step_s or stride_steps")
-    origins = first + stride_ns * np.arange(1, num_windows + 1, dtype=np.int64)
-    return Grid(step_ns, config.history_steps, config.horizon_steps, origins, config.context_steps)
-
-
-def suggest_step_s(times_ns: list[Int64s]) -> float:
-    """A sixteenth of the gap in which a random moment lies (time-weighted median), rounded to a plain number.
-
-    Long absences (an agent that leaves for hours) are left out: they are not gaps within a track.
-    """
-    gaps = np.concatenate([np.diff(times) for times in times_ns]).astype(np.float64) * 1e-9
-    gaps = np.sort(gaps[gaps > 0])
-    if len(gaps) == 0:
-        return 1.0
-    median = gaps[np.searchsorted(np.cumsum(gaps), 0.5 * gaps.sum())]
-    gaps = gaps[gaps <= 20.0 * median]
-    median = gaps[np.searchsorted(np.cumsum(gaps), 0.5 * gaps.sum())]
-    exponent = math.floor(math.log10(median / _STEPS_PER_GAP))
-    mantissa = median / _STEPS_PER_GAP / 10.0**exponent
-    return float(_NICE[np.argmin(np.abs(np.log(_NICE / mantissa)))] * 10.0**exponent)
 
 
 def build_windows(detections: pa.Table, grid: Grid, seed: int, default_sigma_m: float = 0.0) -> MissionWindows:
@@ -235,10 +136,6 @@ def truth_on_grid(truth: pa.Table, windows: MissionWindows, max_gap_s: float) ->
             position[:, index] = found - windows.datum_m[:, None]
     is_known_everywhere = np.isfinite(position[..., 0])
     return torch.from_numpy(np.nan_to_num(position)), torch.from_numpy(is_known_everywhere)
-
-
-def _times_by_agent(table: pa.Table) -> list[Int64s]:
-    return [track.time_ns for _, track in agent_tracks(table, 0.0)]
 
 
 def _one_per_cell(track: DetectionTrack, grid: Grid) -> DetectionTrack:

@@ -52,7 +52,8 @@ FLOORS = {
         {"files"},
         {"manifest", "tables"},
         {"frames", "stores", "logs", "mapping", "tracks"},
-        {"missions", "checkpoints", "windows", "results"},
+        {"missions", "checkpoints", "grids", "results"},
+        {"windows"},
         {"catalogue", "associations"},
         {"estimators", "scoring"},
         {"ingest", "extract", "infer", "export", "report", "simulate"},  # no stage imports another

@@ -44,6 +44,7 @@ def stage_summary(result: StageResult) -> str:
     lines += [f"  {line}" for line in result.summary.get("verdict", ())]
     lines += score_lines(result.summary.get("scores", ()))
     lines += [f"  suspected {line}" for line in few(suspicions_in(result.summary))]
+    lines += [f"  note: {line}" for line in result.summary.get("remarks", ())]
     return "\n".join(lines + [f"  {path}" for path in result.outputs])
 
 
@@ -112,6 +113,7 @@ def batch_summary(outcomes: Sequence[LogOutcome], told: Collection[str] = ()) ->
             lines += [f"{outcome.task.name}: damaged: {problem}" for problem in stage.summary.get("problems", ())]
             lines += [f"{outcome.task.name}: suspected {line}" for line in few(suspicions_in(stage.summary))]
         lines += [f"{outcome.task.name}: assumed: {line}" for line in _assumptions(summary)]
+        lines += [f"{outcome.task.name}: note: {line}" for line in summary.get("remarks", ())]
     return "\n".join([*_table(rows), *lines, *_to_open(outcomes)])
 
 

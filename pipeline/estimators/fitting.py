@@ -9,7 +9,8 @@ import torch
 from cadence.bank.bank import Bank
 from cadence.bank.hindsight import choose_by_hindsight
 from cadence.types import Detections, WindowBatch
-from pipeline.windows import Grid, MissionWindows, fit_tracks, later_detections
+from pipeline.grids import Grid
+from pipeline.windows import MissionWindows, fit_tracks, later_detections
 
 _HINDSIGHT_ROWS = 64
 """So many tracks are tried: the choice among settings of a bank and the network's part in it cost what they draw."""

@@ -17,7 +17,7 @@ from pipeline.checkpoints import expect_preset, load_network, network_config
 from pipeline.estimators.fitting import FittingData
 from pipeline.estimators.loaded import Fitted, Loaded
 from pipeline.estimators.samplings import Samplings
-from pipeline.windows import GridConfig
+from pipeline.grids import GridConfig
 
 
 def load_general(weights: Path | None, samplings: Samplings) -> Loaded:

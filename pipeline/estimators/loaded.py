@@ -6,7 +6,7 @@ from typing import Any
 
 from cadence.types import Estimator
 from pipeline.estimators.fitting import FittingData
-from pipeline.windows import GridConfig
+from pipeline.grids import GridConfig
 
 
 @dataclass(frozen=True, eq=False)

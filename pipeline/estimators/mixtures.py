@@ -10,7 +10,7 @@ from cadence.baselines.vrnn import VrnnNetwork, VrnnNetworkConfig
 from pipeline.checkpoints import CheckpointInfo, expect_preset, load_network, network_config
 from pipeline.estimators.loaded import Loaded
 from pipeline.estimators.samplings import Samplings
-from pipeline.windows import GridConfig
+from pipeline.grids import GridConfig
 
 Rival = Literal["vrnn", "grammi_without_mi", "grammi"]
 RIVALS: tuple[Rival, ...] = ("vrnn", "grammi_without_mi", "grammi")

@@ -7,7 +7,7 @@ from cadence.network.trajectory import TrajectoryNetwork
 from pipeline.checkpoints import expect_preset, load_network, network_config
 from pipeline.estimators.loaded import Loaded
 from pipeline.estimators.samplings import Samplings
-from pipeline.windows import GridConfig
+from pipeline.grids import GridConfig
 
 
 def load_paper(weights: Path, samplings: Samplings) -> Loaded:

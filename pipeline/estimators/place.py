@@ -11,7 +11,7 @@ from cadence.recordings import NUM_STEPS
 from pipeline.checkpoints import expect_preset, load_network, network_config
 from pipeline.estimators.loaded import Loaded
 from pipeline.estimators.samplings import Samplings
-from pipeline.windows import GridConfig
+from pipeline.grids import GridConfig
 
 _CONTEXT_STEPS = 4320
 """The longest mission of the paper's worlds."""

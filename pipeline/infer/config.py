@@ -9,7 +9,7 @@ from cadence.diffusion.general import SamplerName
 from cadence.diffusion.place import PlaceSampling
 from pipeline.checkpoints import DEFAULT
 from pipeline.estimators.samplings import GeneralSampling, Samplings
-from pipeline.windows import GridConfig
+from pipeline.grids import GridConfig
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,8 @@ from torch import Tensor
 
 from cadence import metrics
 from pipeline.associations import AssociatedWindows
-from pipeline.windows import Grid, MissionWindows
+from pipeline.grids import Grid
+from pipeline.windows import MissionWindows
 from schemas.tables import WINDOWS, hypotheses_schema
 
 ADVICE = {

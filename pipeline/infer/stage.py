@@ -1,5 +1,6 @@
 """Infer: detections → hypotheses: the model fitted to the log, all windows batched, constraints kept."""
 
+import time
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -28,6 +29,9 @@ from pipeline.suspicions import Suspicions
 from pipeline.tables import Frame, read_table, write_table
 from pipeline.threads import in_order, num_cores, one_thread
 from pipeline.windows import MissionWindows, build_windows
+
+_FIRST_S, _LONG_S = 5.0, 120.0
+"""After how long one knows what is ahead, and from when on somebody who waits wants to have been told."""
 
 
 def infer(
@@ -62,6 +66,7 @@ def infer(
         return {
             **summary,
             "step_s": plan.seen.sources.grid.step_s,
+            "remarks": list(plan.seen.sources.grid.remarks),
             "context_steps": plan.seen.sources.grid.context_steps,
             "checkpoint": plan.checkpoint,
             "checkpoint_sha256": _hash(plan.checkpoint),
@@ -91,22 +96,36 @@ def _mission_start_ns(directory: Path, detections: pa.Table) -> int:
 def _draw(plan: "_Plan", draws: Iterable[Drawn], log_id: str, folder: Path, frame: Frame, progress: Progress) -> dict[str, Any]:
     """All windows into the two tables; what the summary says of them."""
     parts, statuses = [], []
-    with progress.bar(plan.windows.batch.num_windows, "infer", unit="window") as bar:
+    num_windows, begun_s, is_told, num_done = plan.windows.batch.num_windows, time.monotonic(), False, 0
+    with progress.bar(num_windows, "infer", unit="window") as bar:
         for part, positions, weight, status in draws:
             parts.append(hypothesis_rows(log_id, plan.windows, plan.seen.sources.grid, part, positions, weight))
             rows = window_rows(plan.windows, part, positions, weight, status)
             statuses.append(rows if plan.seen.associated is None else with_association(rows, plan.seen.associated, part))
             bar.update(len(part))
+            num_done, taken_s = num_done + len(part), time.monotonic() - begun_s
+            if not is_told and taken_s > _FIRST_S:
+                is_told = True
+                _tell_cost(num_windows, num_windows * taken_s / num_done, progress)
     tracks, windows = pa.concat_tables(parts), pa.concat_tables(statuses)
     write_table(tracks, folder / "hypotheses.parquet", "hypotheses", frame)
     write_table(windows, folder / "windows.parquet", "windows", frame)
     counts = windows["status"].value_counts().to_pylist()
     return {
-        "num_windows": plan.windows.batch.num_windows,
+        "num_windows": num_windows,
         "num_agents": pc.count_distinct(tracks["agent_id"]).as_py(),
         "num_tracks": tracks.num_rows,
         "status": {str(item["values"]): int(item["counts"]) for item in counts},
     }
+
+
+def _tell_cost(num_windows: int, seconds: float, progress: Progress) -> None:
+    """What is ahead, by what the first windows took, where one might wish to have fewer."""
+    if seconds > _LONG_S:
+        progress.note(
+            f"infer: {num_windows} windows, about {seconds / 60.0:.0f} min by the first ones; "
+            "a larger infer.grid.stride_steps takes fewer"
+        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,6 +14,7 @@ from cadence.constraints.checker import segments_in_collision, states_in_collisi
 from cadence.errors import InputError
 from cadence.types import HypothesisSet, WindowBatch
 from pipeline.associations import DataAssociation, Sources, build_associated_windows
+from pipeline.grids import Grid
 from pipeline.manifest import read_manifest
 from pipeline.obstacle_file import OBSTACLES_NAME, read_obstacles
 from pipeline.results import MissionHypotheses
@@ -21,7 +22,7 @@ from pipeline.scoring.matching import match_to_truth, matched_windows
 from pipeline.scoring.scores import IsInside
 from pipeline.tables import read_table
 from pipeline.tracks import UNKNOWN_AGENT
-from pipeline.windows import Grid, MissionWindows, build_windows, truth_on_grid
+from pipeline.windows import MissionWindows, build_windows, truth_on_grid
 
 LABELS_NAME = "labels.parquet"
 _TRUTH_GAP_STEPS = 2.0

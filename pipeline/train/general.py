@@ -11,6 +11,7 @@ from cadence.training.loop import Trainer, untrained
 from cadence.training.residual import residual_loss
 from cadence.training.synthetic import ResidualWindows, join_windows, residual_windows
 from pipeline.estimators.fitting import FittingData
+from pipeline.grids import GridConfig, plan_grid
 from pipeline.manifest import StageResult
 from pipeline.progress import Progress
 from pipeline.train.config import TrainConfig
@@ -18,7 +19,7 @@ from pipeline.train.lessons import Source, lessons_of
 from pipeline.train.missions import TrainingMission, missions_of_logs
 from pipeline.train.run import TrainingRun, run_training
 from pipeline.train.shards import synthetic_shard
-from pipeline.windows import GridConfig, build_windows, plan_grid, truth_on_grid
+from pipeline.windows import build_windows, truth_on_grid
 
 _VALIDATION_SHARE = 0.1
 _STEPS_A_SHARD = 120

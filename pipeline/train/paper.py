@@ -23,13 +23,14 @@ from cadence.training.loop import Trainer, untrained
 from cadence.worlds.patrol import simulate_patrol
 from pipeline.arrays import Column
 from pipeline.episodes.pool import load_pool
+from pipeline.grids import Grid
 from pipeline.manifest import StageResult
 from pipeline.progress import Progress
 from pipeline.train.config import AbsoluteTraining, TrainConfig
 from pipeline.train.lessons import Source, lessons_of
 from pipeline.train.missions import TrainingMission, mission_of_episode, missions_of_logs
 from pipeline.train.run import TrainingRun, run_training
-from pipeline.windows import Grid, MissionWindows, build_windows, truth_on_grid
+from pipeline.windows import MissionWindows, build_windows, truth_on_grid
 
 _STEPS_AN_EPISODE = 10
 """A new simulated episode joins after this many steps, so that simulating does not hold up the start."""

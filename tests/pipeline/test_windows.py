@@ -1,6 +1,5 @@
 """Tables to windows: grid, kept detections, what lies before and after the origin, truth on the grid, units."""
 
-import dataclasses
 import math
 
 import numpy as np
@@ -10,18 +9,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cadence.errors import ConfigError, InputError
+from cadence.errors import InputError
+from pipeline.grids import GridConfig, plan_grid, suggest_step_s
 from pipeline.tracks import UNKNOWN_AGENT
-from pipeline.windows import (
-    GridConfig,
-    build_windows,
-    fit_tracks,
-    later_detections,
-    plan_grid,
-    suggest_step_s,
-    truth_on_grid,
-    window_seeds,
-)
+from pipeline.windows import build_windows, fit_tracks, later_detections, truth_on_grid, window_seeds
 
 START_NS = 1_700_000_000_000_000_000
 CONFIG = GridConfig(step_s=1.0, history_steps=8, horizon_steps=4, stride_steps=4)
@@ -55,7 +46,7 @@ def table(
 
 
 def test_origins_cover_the_mission() -> None:
-    grid = plan_grid(table([0.0, 3.0, 17.5]), CONFIG)
+    grid = plan_grid(table([0.0, 3.0, 10.0, 17.5]), CONFIG)
     assert grid.step_ns == 1_000_000_000 and grid.step_s == 1.0
     assert ((grid.origins_ns - START_NS) / 1e9).tolist() == [4.0, 8.0, 12.0, 16.0, 20.0]
     assert grid.time_s.tolist() == [float(t) for t in range(-7, 5)]
@@ -73,8 +64,6 @@ def test_a_single_detection_has_one_window_that_holds_it() -> None:
 def test_tables_and_settings_that_cannot_be_used() -> None:
     with pytest.raises(InputError, match="nothing was detected"):
         plan_grid(table([]), CONFIG)
-    with pytest.raises(ConfigError, match="larger step_s"):
-        plan_grid(table([0.0, 1e7]), dataclasses.replace(CONFIG, step_s=0.01))
     for wrong in ({"step_s": 0.0}, {"step_s": math.nan}, {"history_steps": 0}, {"stride_steps": 0}, {"horizon_steps": -1}):
         with pytest.raises(ValueError, match=r"must be|at least"):
             GridConfig(**wrong)

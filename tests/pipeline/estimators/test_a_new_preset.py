@@ -17,11 +17,11 @@ from pipeline.estimators import presets
 from pipeline.estimators.loaded import Loaded
 from pipeline.estimators.presets import Preset, load_estimator, load_forecaster, refuse_unread
 from pipeline.estimators.samplings import Samplings
+from pipeline.grids import GridConfig
 from pipeline.infer.config import InferConfig
 from pipeline.infer.stage import infer
 from pipeline.progress import Progress
 from pipeline.results import read_hypothesis_tables
-from pipeline.windows import GridConfig
 
 
 @dataclasses.dataclass(frozen=True)

@@ -14,12 +14,13 @@ from cadence.errors import ImplausibleInputError
 from cadence.types import Detections, HypothesisSet, WindowBatch
 from pipeline.estimators.fit_test import FitTest, fit_test
 from pipeline.estimators.fitting import FittingData
+from pipeline.grids import GridConfig, plan_grid
 from pipeline.infer import stage
 from pipeline.infer.config import InferConfig
 from pipeline.progress import Progress
 from pipeline.suspicions import suspicions_in
 from pipeline.tables import Frame, write_table
-from pipeline.windows import GridConfig, build_windows, plan_grid
+from pipeline.windows import build_windows
 from schemas.tables import DETECTIONS
 
 STEP_S = 60.0

@@ -16,12 +16,13 @@ from cadence.types import Detections, HypothesisSet, WindowBatch
 from pipeline import associations
 from pipeline.evaluate.joint import JOINT_METRICS, JointScorer
 from pipeline.evaluate.stage import EvaluateConfig, evaluate, score_mission
+from pipeline.grids import GridConfig, plan_grid
 from pipeline.infer.stage import infer
 from pipeline.progress import Progress
 from pipeline.scoring.matching import match_to_truth, matched
 from pipeline.scoring.scores import PARTS, score_cells
 from pipeline.tables import Frame, write_table
-from pipeline.windows import GridConfig, build_windows, plan_grid
+from pipeline.windows import build_windows
 from schemas.tables import TRUTH
 
 QUIET = Progress(quiet=True)

@@ -21,6 +21,7 @@ from pipeline.estimators.fitting import FittingData
 from pipeline.estimators.presets import load_estimator
 from pipeline.estimators.samplings import GeneralSampling, Samplings
 from pipeline.files import hash_file
+from pipeline.grids import GridConfig, plan_grid
 from pipeline.infer import draws
 from pipeline.infer.config import InferConfig
 from pipeline.infer.draws import draw_windows
@@ -29,7 +30,7 @@ from pipeline.manifest import StageResult, read_manifest
 from pipeline.obstacle_file import read_obstacles
 from pipeline.progress import Progress
 from pipeline.tables import Frame, read_table, write_table
-from pipeline.windows import GridConfig, build_windows, plan_grid
+from pipeline.windows import build_windows
 from schemas.tables import DETECTIONS, WINDOWS, hypotheses_schema
 
 QUIET = Progress(quiet=True)

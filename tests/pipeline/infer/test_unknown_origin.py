@@ -31,6 +31,7 @@ from pipeline import associations
 from pipeline.associations import AssociatedWindows, DataAssociation, build_associated_windows, shared_out, tell_sources
 from pipeline.export.config import ExportConfig
 from pipeline.export.stage import export
+from pipeline.grids import GridConfig
 from pipeline.infer.config import InferConfig
 from pipeline.infer.draws import draw_associations
 from pipeline.infer.stage import infer
@@ -40,7 +41,6 @@ from pipeline.report.stage import ReportConfig, report
 from pipeline.results import read_hypothesis_tables
 from pipeline.tables import Frame, read_table, write_table
 from pipeline.tracks import UNKNOWN_AGENT
-from pipeline.windows import GridConfig
 from schemas.channels import message_class
 from schemas.tables import ASSOCIATIONS, LABELS
 

@@ -23,13 +23,14 @@ from pipeline.episodes.recordings import RecordingsConfig, save_recordings
 from pipeline.estimators.paper import absolute_grid, load_absolute
 from pipeline.estimators.presets import load_forecaster
 from pipeline.extract.config import ExtractConfig
+from pipeline.grids import plan_grid
 from pipeline.progress import Progress
 from pipeline.simulate.stage import SimulateConfig, simulate
 from pipeline.train.config import AbsoluteTraining, TrainConfig
 from pipeline.train.missions import mission_of_episode, missions_of_logs
 from pipeline.train.paper import draw_windows, mission_windows
 from pipeline.train.stage import train
-from pipeline.windows import build_windows, plan_grid
+from pipeline.windows import build_windows
 
 QUIET = Progress(quiet=True)
 PATROL = PatrolConfig(duration_s=3600.0, step_s=30.0, detection_rate=0.3)
