@@ -13,6 +13,29 @@ def exceeds(position_m: Tensor, longest_m: float) -> Tensor:
     return is_long.any(dim=-1)
 
 
+def needed_speed(time_s: Tensor, position_m: Tensor, sigma_m: Tensor, is_observed: Tensor) -> tuple[Tensor, Tensor]:
+    """The speed that two detections of a row ask for at least, each allowed to err by two sigma, and the time between them.
+
+    Args:
+        time_s: [R, N] seconds, oldest first.
+        position_m: [R, N, 2].
+        sigma_m: [R, N] standard deviation along an axis.
+        is_observed: [R, N] False on padding, which stands last.
+
+    Returns:
+        Metres a second and seconds [R] of the two consecutive detections that ask for most; zeros where there are not two.
+    """
+    is_pair = is_observed[:, 1:]
+    doubt_m = 2.0 * (sigma_m[:, 1:] + sigma_m[:, :-1])
+    apart_m = (position_m.diff(dim=1).norm(dim=-1) - doubt_m).clamp_min(0.0)
+    gap_s = time_s.diff(dim=1)
+    speed = torch.where(is_pair & (apart_m > 0.0), apart_m / gap_s.clamp_min(1e-9), 0.0)
+    if not speed.shape[1]:
+        return torch.zeros(len(time_s), dtype=torch.float64), torch.zeros(len(time_s), dtype=torch.float64)
+    fastest, pair = speed.max(dim=1)
+    return fastest, torch.where(fastest > 0.0, gap_s.gather(1, pair[:, None])[:, 0], 0.0)
+
+
 def limit_steps(position_m: Tensor, is_pinned: Tensor, longest_m: float) -> tuple[Tensor, Tensor]:
     """Tracks whose steps are at most so long, and which of them could be had.
 

@@ -29,7 +29,7 @@ from pipeline.progress import Progress
 from pipeline.results import read_hypothesis_tables
 from pipeline.scoring.case import LABELS_NAME, Case, collision_test, read_case
 from pipeline.scoring.motion import MotionLaws, true_motion
-from pipeline.scoring.scores import Cells, Draw, score_in_chunks
+from pipeline.scoring.scores import Cells, Draw, IsInside, score_in_chunks
 from pipeline.windows import build_windows
 
 
@@ -182,7 +182,14 @@ def score_mission(directory: Path, config: EvaluateConfig, progress: Progress) -
         true_motion=truth.laws(),
         gospa_cutoff_m=case.cutoff_m if case.is_joint else None,
         is_matched=case.is_matched,
+        true_collision_share=None if collides is None else _collision_share(collides, case.truth_m, case.is_known),
     )
+
+
+def _collision_share(collides: IsInside, truth_m: Tensor, is_known: Tensor) -> float:
+    """Share of the known steps of the truth [B, A, T, 2] that touch an obstacle."""
+    hit = collides(truth_m[:, None], torch.arange(len(truth_m)))[:, 0]
+    return float(hit[is_known].double().mean()) if bool(is_known.any()) else 0.0
 
 
 def _fitting(case: Case, seed: int) -> FittingData:

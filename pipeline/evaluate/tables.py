@@ -49,6 +49,7 @@ class ScoredMission:
 
     cells         by estimator, OWN_NAME first; all in the same order
     num_unscored  (window, agent) pairs with truth and detections but without hypotheses: these are spared
+    true_collision_share  of the steps of the truth, those that touch an obstacle; None without obstacles
     motion, true_motion  how hypotheses move, by estimator, and how the truth does
     joint         by estimator, scores of all agents together; empty for one agent
     is_matched    detections are of unknown origin: agents were matched to those of the truth
@@ -67,6 +68,7 @@ class ScoredMission:
     is_matched: bool = False
     motion: dict[str, MotionLaws] = field(default_factory=dict)
     true_motion: MotionLaws = field(default_factory=dict)
+    true_collision_share: float | None = None
 
 
 @dataclass(frozen=True)
@@ -82,6 +84,7 @@ class ScoredLog:
     num_unscored: int
     gospa_cutoff_m: float | None = None
     is_matched: bool = False
+    true_collision_share: float | None = None
 
 
 @dataclass(frozen=True)
@@ -128,6 +131,7 @@ def pool(missions: Sequence[ScoredMission], num_resamples: int, seed: int) -> Sc
         ScoredLog(
             mission.log_id, mission.step_s, mission.num_windows, len(mission.agent_ids), mission.num_hypotheses,
             mission.max_truth_gap_s, mission.num_unscored, mission.gospa_cutoff_m, mission.is_matched,
+            mission.true_collision_share,
         )
         for mission in missions
     )  # fmt: skip
@@ -191,8 +195,20 @@ def as_markdown(report: ScoreReport) -> str:
 
 
 def verdict(report: ScoreReport) -> list[str]:
-    """A sentence each on the past and the future: against the best rival, and whether the 90 % region can be believed."""
-    return [" ".join([f"{part.capitalize()}:", *found]) for part in ("past", "future") if (found := _verdict(report, part))]
+    """What to believe: a sentence on past and future each (best rival, 90 % region), and one on obstacles that are none."""
+    parts = [" ".join([f"{part.capitalize()}:", *found]) for part in ("past", "future") if (found := _verdict(report, part))]
+    return [*parts, *_entered(report.logs)]
+
+
+def _entered(logs: Sequence[ScoredLog]) -> Iterator[str]:
+    """A line for the log whose truth was most in obstacles, where any was: hypotheses keep out of what is none."""
+    shares = [(log.true_collision_share or 0.0, log.log_id) for log in logs]
+    share, log_id = max(shares, default=(0.0, ""))
+    if share > 0.0:
+        yield (
+            f"Obstacles: {max(100 * share, 0.1):.3g} % of the true steps of {log_id} touch one, and hypotheses keep out "
+            'of them; check where they lie, or set infer.guidance.mode = "none".'
+        )
 
 
 def _verdict(report: ScoreReport, part: str) -> list[str]:

@@ -6,6 +6,8 @@ import torch
 from torch import Tensor
 
 from cadence import metrics
+from cadence.constraints.speed import needed_speed
+from cadence.types import Detections
 from pipeline.associations import AssociatedWindows
 from pipeline.grids import Grid
 from pipeline.windows import MissionWindows
@@ -50,8 +52,11 @@ def hypothesis_rows(
     return pa.Table.from_arrays([column.cast(item.type) for column, item in zip(columns, schema, strict=True)], schema=schema)
 
 
-def window_rows(windows: MissionWindows, part: Tensor, position: Tensor, weight: Tensor, status: list[list[str]]) -> pa.Table:
-    """WINDOWS rows of every agent."""
+def window_rows(
+    windows: MissionWindows, part: Tensor, position: Tensor, weight: Tensor, status: list[list[str]],
+    max_speed_mps: float | None = None,
+) -> pa.Table:  # fmt: skip
+    """WINDOWS rows of every agent; what is infeasible because detections ask for more than `max_speed_mps` says so."""
     now = windows.batch.origin_index
     spread = metrics.spread(position[:, :, :, now : now + 1], weight)[..., 0]
     detections = windows.batch.detections[part]
@@ -66,13 +71,27 @@ def window_rows(windows: MissionWindows, part: Tensor, position: Tensor, weight:
                     "origin_ns": int(windows.origins_ns[window]),
                     "agent_id": agent,
                     "status": status[index][a],
-                    "advice": ADVICE[status[index][a]],
+                    "advice": _advice(status[index][a], detections[index : index + 1], a, max_speed_mps),
                     "num_detections": int(detections.count[index, a]),
                     "age_s": float(age[index, a]) if is_active else None,
                     "spread_m": float(spread[index, a]) if is_active else None,
                 }
             )
     return pa.Table.from_pylist(rows, schema=WINDOWS)
+
+
+def _advice(status: str, seen: Detections, agent: int, max_speed_mps: float | None) -> str | None:
+    """What to do about the status of an agent in one window, whose detections are `seen`."""
+    if status != "infeasible" or max_speed_mps is None:
+        return ADVICE[status]
+    sigma_m = seen.covariance_m2.diagonal(dim1=-2, dim2=-1).mean(-1).sqrt()
+    speed, gap_s = needed_speed(*(value[:, agent] for value in (seen.time_s, seen.position_m, sigma_m, seen.is_observed)))
+    if float(speed[0]) <= max_speed_mps:
+        return ADVICE[status]
+    return (
+        f"two detections {float(gap_s[0]):.3g} s apart need {float(speed[0]):.3g} m/s, and infer.guidance.max_speed_mps is "
+        f"{max_speed_mps:g}; raise it, or state in sigma_m how rough the positions are"
+    )
 
 
 def with_association(rows: pa.Table, associated: AssociatedWindows, part: Tensor) -> pa.Table:

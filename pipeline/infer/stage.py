@@ -100,7 +100,7 @@ def _draw(plan: "_Plan", draws: Iterable[Drawn], log_id: str, folder: Path, fram
     with progress.bar(num_windows, "infer", unit="window") as bar:
         for part, positions, weight, status in draws:
             parts.append(hypothesis_rows(log_id, plan.windows, plan.seen.sources.grid, part, positions, weight))
-            rows = window_rows(plan.windows, part, positions, weight, status)
+            rows = window_rows(plan.windows, part, positions, weight, status, plan.max_speed_mps)
             statuses.append(rows if plan.seen.associated is None else with_association(rows, plan.seen.associated, part))
             bar.update(len(part))
             num_done, taken_s = num_done + len(part), time.monotonic() - begun_s
@@ -172,6 +172,7 @@ class _Plan:
     draws: Iterator[Piece]
     about: Mapping[str, Any]
     suspicions: Suspicions
+    max_speed_mps: float | None
 
     @staticmethod
     def of(config: InferConfig, detections: pa.Table, obstacles: Obstacles, start_ns: int) -> "_Plan":
@@ -194,7 +195,8 @@ class _Plan:
         else:
             associated = seen.associated.located(start_ns, obstacles)
             draws = (draw_tracks if loaded.is_apart else draw_associations)(estimator, associated, num)
-        return _Plan(config.checkpoint, seen, draws, {**fitted.about, **about}, suspicions)
+        about = {**fitted.about, **about}
+        return _Plan(config.checkpoint, seen, draws, about, suspicions, config.guidance.max_speed_mps)
 
     @property
     def windows(self) -> MissionWindows:

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from cadence.constraints.speed import exceeds, limit_steps
+from cadence.constraints.speed import exceeds, limit_steps, needed_speed
 
 
 def tracks(num: int = 50, steps: int = 30, seed: int = 0) -> Tensor:
@@ -64,3 +64,15 @@ def test_two_pins_too_far_apart_are_not_kept_and_the_rest_is() -> None:
     track = torch.tensor([[[0.0, 0.0], [9.0, 0.0], [9.0, 9.0]]], dtype=torch.float64)
     moved, is_kept = limit_steps(track, pins(1, 3, 0, 1), 2.0)
     assert not bool(is_kept) and moved[0, 2].tolist() == pytest.approx([9.0, 2.0])
+
+
+def test_the_speed_that_detections_ask_for() -> None:
+    """Between 10 s and 12 s 100 m, of which 4 m may be noise, in the second row 40; the third row has one detection only."""
+    time_s = torch.tensor([[0.0, 10.0, 12.0, 99.0]]).double().expand(3, 4)
+    place = torch.tensor([[0.0, 0.0], [30.0, 0.0], [30.0, 100.0], [5000.0, 0.0]]).double().expand(3, 4, 2)
+    sigma = torch.tensor([[1.0], [10.0], [1.0]]).double().expand(3, 4)
+    is_observed = torch.tensor([[True, True, True, False], [True, True, True, False], [True, False, False, False]])
+    speed, gap_s = needed_speed(time_s, place, sigma, is_observed)
+    assert speed.tolist() == pytest.approx([48.0, 30.0, 0.0]) and gap_s.tolist() == [2.0, 2.0, 0.0]
+    none = needed_speed(time_s[:, :1], place[:, :1], sigma[:, :1], is_observed[:, :1])
+    assert none[0].tolist() == [0.0] * 3

@@ -1,6 +1,7 @@
 """Scoring missions: cells against hand-made windows, the stage on a small mission, pooling, and what must be refused."""
 
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -176,6 +177,22 @@ def test_collisions_are_those_of_the_stated_obstacles(tmp_path: Path) -> None:
     assert shares([{"kind": "circle", "x_m": 1e7, "y_m": 1e7, "radius_m": 1.0}]) == [0.0, 0.0]
     some = shares([{"kind": "circle", "x_m": 1700.0, "y_m": -100.0, "radius_m": 40.0}])
     assert all(0.0 < share < 0.5 for share in some)
+
+
+def test_truth_that_enters_an_obstacle_is_told(tmp_path: Path) -> None:
+    mission, config = build_mission(tmp_path), EvaluateConfig(rivals=())
+
+    def line(radius_m: float, x_m: float = 1700.0) -> list[str]:
+        circle = {"kind": "circle", "x_m": x_m, "y_m": -100.0, "radius_m": radius_m}
+        (mission / "obstacles.json").write_text(json.dumps({"version": 1, "obstacles": [circle]}))
+        return [words for words in evaluate(mission, config, QUIET).summary["verdict"] if words.startswith("Obstacles:")]
+
+    assert line(1e5) == [
+        "Obstacles: 100 % of the true steps of patrol touch one, and hypotheses keep out of them; check where they lie, or set "
+        'infer.guidance.mode = "none".'
+    ]
+    assert re.match(r"Obstacles: \d{1,2}(\.\d+)? % of", line(300.0)[0])
+    assert line(40.0, 1e7) == []
 
 
 def test_agents_without_hypotheses_are_counted(tmp_path: Path) -> None:

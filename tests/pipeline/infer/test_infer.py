@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -252,6 +253,19 @@ def test_a_detection_inside_an_obstacle_is_infeasible_and_says_so(tmp_path: Path
     assert rows[4]["status"] == "ok"
     found, position = tracks(directory)
     assert len(found) == 15 and np.isfinite(position).all()  # infeasible ones are written too
+
+
+def test_detections_that_need_more_than_the_stated_speed_say_how_much(tmp_path: Path) -> None:
+    directory = mission(tmp_path)
+    run(directory, guidance=GuidanceConfig(max_speed_mps=0.5))
+    windows, _ = read_table(directory / "windows.parquet", "windows")
+    advice = {row["advice"] for row in windows.to_pylist() if row["status"] == "infeasible"}
+    assert advice and all(
+        re.fullmatch(r"two detections \S+ s apart need \S+ m/s, and infer\.guidance.*", line) for line in advice
+    )
+    run(directory, guidance=GuidanceConfig(max_speed_mps=500.0))
+    windows, _ = read_table(directory / "windows.parquet", "windows")
+    assert "infeasible" not in windows["status"].to_pylist()
 
 
 def test_samples_that_are_not_finite_are_replaced(tmp_path: Path) -> None:
