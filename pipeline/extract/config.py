@@ -21,6 +21,7 @@ class ExtractConfig:
     simultaneity_s   detections of one agent within this time are collapsed into one
     topics           patterns ("/radar/*"); take positions only from topics that fit one of them; empty: from all
     start, end       use only messages logged in this part: seconds after the log's first message, or a moment (ISO 8601)
+    max_detections   a log with more is refused, before it is read where its message counts tell: a million takes a gigabyte
     frame            name of the fixed frame to bring detections into, by the log's transforms; by default their own where it
                      does not move, else the one that it moves in
     max_extrapolation_s   how long before its first and after its last sample a transform holds; later positions are refused
@@ -44,6 +45,7 @@ class ExtractConfig:
     topics: tuple[str, ...] = ()
     start: float | str | None = None
     end: float | str | None = None
+    max_detections: int = 1_000_000
     frame: str | None = None
     max_extrapolation_s: float = 0.5
     max_transform_gap_s: float = 10.0
@@ -57,6 +59,8 @@ class ExtractConfig:
     def __post_init__(self) -> None:
         if not 0 <= self.simultaneity_s < np.inf:
             raise ValueError("simultaneity_s must not be negative")
+        if self.max_detections < 1:
+            raise ValueError(f"max_detections must be at least 1, got {self.max_detections}")
         if self.default_sigma_m is not None and not 0 < self.default_sigma_m < np.inf:
             raise ValueError("default_sigma_m must be positive")
         if self.max_speed_mps is not None and not self.max_speed_mps > 0:

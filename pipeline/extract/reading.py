@@ -6,6 +6,7 @@ from typing import Final
 
 import numpy as np
 
+from cadence.errors import InputError
 from pipeline.extract.channel_reader import ChannelReader
 from pipeline.logs.channels import Batch
 from pipeline.logs.decode import UndecodableChannel, UndecodableMessage, decoder_for, with_definition
@@ -23,9 +24,16 @@ def read_positions(
     progress: Progress,
     start_ns: int | None = None,
     end_ns: int | None = None,
+    max_detections: int | None = None,
 ) -> Counter[str]:
-    """Feed the messages of the readers' channels with start_ns <= log time < end_ns to them; counts of what was not used."""
+    """Feed the messages of the readers' channels with start_ns <= log time < end_ns to them; counts of what was not used.
+
+    Raises `InputError` as soon as there are more than `max_detections`: before anything is read where the log says so.
+    """
     counts: Counter[str] = Counter()
+    detecting = [reader for reader in readers if reader.role == "detections"]
+    if start_ns is None and end_ns is None:
+        _refuse_flood(detecting, sum(reader.channel.message_count or 0 for reader in detecting), max_detections)
     by_channel: dict[int, list[ChannelReader]] = {}
     for reader in readers:
         by_channel.setdefault(reader.channel.id, []).append(reader)
@@ -44,6 +52,7 @@ def read_positions(
     topics = {reader.channel.topic for reader in readers}
 
     def advance(num_bytes: int) -> None:
+        _refuse_flood(detecting, sum(len(reader.rows.agents) for reader in detecting), max_detections)
         bar.update(num_bytes)
 
     with progress.bar(log.size_bytes, "extract", unit="B", scale=True) as bar:
@@ -61,6 +70,15 @@ def read_positions(
         reader.check()
         counts.update(reader.counts)
     return counts
+
+
+def _refuse_flood(readers: Sequence[ChannelReader], num: int, max_detections: int | None) -> None:
+    if max_detections is not None and num > max_detections:
+        topics = ", ".join(dict.fromkeys(reader.channel.topic for reader in readers))
+        raise InputError(
+            f"{topics}: {num} detections or more, over extract.max_detections = {max_detections}; take a part with --start and "
+            "--end or --topic, or raise the setting"
+        )
 
 
 class _Feed:

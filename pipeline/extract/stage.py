@@ -63,7 +63,7 @@ def write_tables(log: MissionLog, folder: Path, config: ExtractConfig, progress:
     with _about(log):
         channels = selected_channels(log.channels, config.topics)
         readers = select_readers(stated, config.suggest, config.thinning, channels)
-        counts = read_positions(log, readers, progress, *_cut_ns(log, config))
+        counts = read_positions(log, readers, progress, *_cut_ns(log, config), config.max_detections)
         rows, frame = rows_in_frame(log, readers, config, counts, suspicions, transforms)
     counts["unselected_topics"] = len({c.topic for c in log.channels} - {c.topic for c in channels})
     scattered, sigmas_m = _with_accuracy(rows["detections"], readers, config, suspicions)

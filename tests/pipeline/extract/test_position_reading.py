@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from mcap.writer import Writer
 
-from cadence.errors import ConfigError
+from cadence.errors import ConfigError, InputError
 from pipeline.extract.channel_reader import ChannelReader
 from pipeline.extract.covariances import stated_covariance, stated_covariances
 from pipeline.extract.positions import Positions
@@ -100,6 +100,20 @@ def no_decoding(monkeypatch: pytest.MonkeyPatch) -> None:
         raise AssertionError("was decoded by itself")
 
     monkeypatch.setattr(ChannelReader, "read", fail)
+
+
+def test_a_flood_is_refused_before_it_is_read_or_as_soon_as_it_comes(tmp_path: Path) -> None:
+    log = open_log(write(tmp_path / "a.mcap", ODOMETRY, [(i, odometry(i)) for i in range(2500)], chunk_size=20_000))
+    reader = ChannelReader(log.channels[0], SourceConfig("/seen"), "detections", True, {})
+    with pytest.raises(InputError, match=r"^/seen: 2500 detections or more, over extract.max_detections = 2000; take a part"):
+        read_positions(log, [reader], Progress(quiet=True), max_detections=2000)
+    assert not reader.rows.agents
+    with pytest.raises(InputError, match=r"--start and --end or --topic"):
+        read_positions(log, [reader], Progress(quiet=True), start_ns=0, max_detections=1000)
+    assert 1000 < len(reader.rows.agents) < 2500
+    fresh = ChannelReader(log.channels[0], SourceConfig("/seen"), "detections", True, {})
+    read_positions(log, [fresh], Progress(quiet=True), start_ns=0, end_ns=900, max_detections=1000)
+    assert len(fresh.rows.agents) == 900
 
 
 def test_sound_messages_are_not_decoded_one_by_one(tmp_path: Path, no_decoding: None) -> None:
