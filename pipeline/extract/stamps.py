@@ -7,7 +7,8 @@ from typing import Any
 
 _SECONDS = ("sec", "secs", "seconds")
 _NANOSECONDS = ("nanosec", "nsec", "nsecs", "nanos")
-_ISO = re.compile(r"(\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d)(?:\.(\d{1,9})\d*)?(Z|[+-]\d\d:?\d\d)?")
+_ISO = re.compile(r"(\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d)(?:\.(\d{1,9})\d*)?(?: ?(Z|UTC|[+-]\d\d:?\d\d)(?: UTC)?)?")
+"""ISO 8601, and as Go writes times: `2023-11-14 22:13:20.123456789 +0000 UTC`."""
 _LIMIT_NS = 2**63
 
 
@@ -60,7 +61,7 @@ def _text_ns(text: str) -> int | None:
     match = _ISO.fullmatch(text)
     if match is not None:
         try:
-            moment = datetime.fromisoformat(match[1].replace(" ", "T") + (match[3] or "Z"))
+            moment = datetime.fromisoformat(match[1].replace(" ", "T") + (match[3] or "Z").replace("UTC", "Z"))
         except ValueError:
             return None
         whole = moment - datetime(1970, 1, 1, tzinfo=UTC)

@@ -8,8 +8,16 @@ from typing import Final
 
 from pipeline.mapping.message_type import FRAME_PATHS, TIME_PATHS, MessageType, geodetic
 
-_NOT_SHIPS = (4, 21)
-"""AIS messages of base stations and of aids to navigation."""
+_NOT_SHIPS = (4, 17, 21)
+"""AIS messages of base stations, of stations that correct GNSS, and of aids to navigation."""
+_NO_REPORTS = (
+    "BaseStationReport",
+    "GnssBroadcastBinaryMessage",
+    "AidsToNavigationReport",
+    "ShipStaticData",
+    "StaticDataReport",
+)
+"""The same by aisstream's names, and what repeats the last position of a ship."""
 _FEATURES = 'features[:]{geometry.type=="Point"}'
 _POINTS = (f"{_FEATURES}.geometry.coordinates", '{geometry.type=="Point"}.geometry.coordinates')
 
@@ -112,7 +120,10 @@ FIXES: Final[dict[str, MessageType]] = {
         (),
         latitude=("lat", "latitude", "MetaData.latitude"),
         longitude=("lon", "longitude", "MetaData.longitude"),
-        where=tuple(f"{name} != {number}" for name in ("type", "msg_type") for number in _NOT_SHIPS),
+        where=(
+            *(f"{name} != {number}" for name in ("type", "msg_type") for number in _NOT_SHIPS),
+            *(f'MessageType != "{name}"' for name in _NO_REPORTS),
+        ),
         time=("time", "rxuxtime", "MetaData.time_utc"),
         agent=("mmsi", "MMSI", "MetaData.MMSI"),
         role="detections",

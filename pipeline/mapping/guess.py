@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, fields, replace
 from typing import Final, Literal
 
 from pipeline.mapping.field_paths import coordinate_paths
-from pipeline.mapping.message_types import MESSAGE_TYPES, SETPOINTS, normalise_schema, type_of_schema
+from pipeline.mapping.message_types import MESSAGE_TYPES, POLAR, SETPOINTS, normalise_schema, type_of_schema
 from pipeline.mapping.sources import ChannelLike, SourceConfig
 from pipeline.mapping.topic_names import DETECTION_WORDS, POSE_WORDS, TRUTH_WORDS, pattern_of, words_of
 
@@ -116,7 +116,7 @@ def _role(channel: ChannelLike) -> Role | None:
         return "tf"
     if (kind in _OBSTACLE_SCHEMAS and known is None) or (known == "SceneUpdate" and _OBSTACLE.intersection(words)):
         return "obstacles"
-    if channel.topic.startswith(OWN_TOPICS) or _is_setpoint(channel):
+    if channel.topic.startswith(OWN_TOPICS) or _is_setpoint(channel) or normalise_schema(channel.schema_name) in POLAR:
         return None
     if known is None:
         if type_of_schema(channel.schema_name) is not None or package in _NEVER_POSITIONS:
@@ -153,6 +153,8 @@ def _why_unused(channel: ChannelLike, role: Role | None) -> str | None:
         return None
     if _is_setpoint(channel) or _may_be_setpoint(channel.topic):
         return "it may be where a vehicle is told to go"
+    if normalise_schema(channel.schema_name) in POLAR:
+        return "ranges and bearings are not used"
     if type_of_schema(channel.schema_name) is not None:
         return "what is drawn may be anything"
     return "its type is not known"

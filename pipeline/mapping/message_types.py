@@ -20,6 +20,9 @@ SETPOINTS: Final = {
 }  # fmt: skip
 """Types of where a vehicle is told to be."""
 
+POLAR: Final = {"radar_msgs.RadarScan", "radar_msgs.RadarReturn", "radar_msgs.RadarPoints", "radar_msgs.RadarPoint"}
+"""Types of ranges and bearings, which are not used."""
+
 
 def normalise_schema(name: str) -> str:
     """`package.Type`, whatever the encoding's way to write it."""

@@ -128,11 +128,13 @@ def test_bodies_of_motion_capture_are_truth_by_name(tmp_path: Path) -> None:
 def test_channels_that_may_hold_detections_are_named(tmp_path: Path) -> None:
     rows = [pose_row(i, 3.0 * i, "/contacts/a") for i in range(8)]
     rows += [Row("/lidar/objects", "own.ObstacleDetections", 1.0, {}), Row("/fused", "own_msgs/msg/TrackedObjectList", 1.0, {})]
+    rows += [Row("/radar/detections", "radar_msgs/msg/RadarScan", 1.0, {"returns": []})]
     rows += [ROS.cdr_row(ROS("visualization_msgs/msg/MarkerArray"), "/viz/targets"), Row("/wheel", "own.Speed", 1.0, {})]
     found = run(tmp_path, rows)
     assert found.summary["unused"] == {
         "/lidar/objects (own.ObstacleDetections)": "its type is not known",
         "/fused (own_msgs/msg/TrackedObjectList)": "its type is not known",
+        "/radar/detections (radar_msgs/msg/RadarScan)": "ranges and bearings are not used",
         "/viz/targets (visualization_msgs/msg/MarkerArray)": "what is drawn may be anything",
     }
     stated = run(tmp_path, [*rows, pose_row(9.0, 1.0, "/more/contacts/b")], detections=[{"topic": "/contacts/{agent}"}])

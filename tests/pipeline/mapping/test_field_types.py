@@ -145,12 +145,19 @@ def test_ais_stations_ashore_are_no_ships(tmp_path: Path) -> None:
     assert rows.agent.tolist() == ["1"]
 
 
+META = {"MMSI": 7, "latitude": 50.5, "longitude": -1.25, "time_utc": "2023-11-14 22:13:25 +0000 UTC"}
+"""What aisstream says beside each message, as Go writes it."""
+
+
 @pytest.mark.parametrize(
     ("message", "expected"),
     [
         ({"type": 1, "mmsi": 7, "lat": 50.5, "lon": -1.25, "time": "2023-11-14T22:13:25Z"}, [("7", 50.5)]),  # gpsd, AIS-catcher
         ({"msg_type": 18, "mmsi": "7", "lat": "50.5", "lon": "-1.25"}, [("7", 50.5)]),  # pyais
-        ({"MetaData": {"MMSI": 7, "latitude": 50.5, "longitude": -1.25}}, [("7", 50.5)]),  # aisstream
+        ({"MetaData": META, "MessageType": "PositionReport"}, [("7", 50.5)]),
+        ({"MetaData": META, "MessageType": "ShipStaticData"}, []),  # repeats the last position
+        ({"MetaData": META, "MessageType": "BaseStationReport"}, []),
+        ({"class": "AIS", "type": 17, "mmsi": 7, "lat": 50.5, "lon": -1.25}, []),
         ({"type": 5, "mmsi": 7, "shipname": "X"}, []),
         ({"type": 4, "mmsi": 7, "lat": 50.5, "lon": -1.25}, []),
     ],
@@ -159,7 +166,7 @@ def test_json_of_ais_decoders(tmp_path: Path, message: dict[str, Any], expected:
     other = {"mmsi": 1, "lat": 50.0, "lon": -1.25}
     rows, _ = read(tmp_path, [Row("/ais", "", 2.0, message), Row("/ais", "", 3.0, other)], message_type="AIS")
     assert list(zip(rows.agent, rows.first, strict=True)) == [*expected, ("1", 50.0)] and set(rows.second) == {-1.25}
-    if "time" in message:
+    if expected and ("time" in message or "MetaData" in message):
         assert rows.time_ns[0] == START_NS + 5 * 10**9
 
 
@@ -206,7 +213,10 @@ def pose_with(kind: str, **values: Any) -> Any:
     return SEEN(kind, pose=SEEN.pose(), **values)
 
 
-SPATIAL = SEEN("depthai_ros_msgs/msg/SpatialDetection", position=SEEN.point(), is_tracking=True, tracking_id="7")
+SPATIAL = SEEN(
+    "depthai_ros_msgs/msg/SpatialDetection", results=[SEEN("vision_msgs/msg/ObjectHypothesis", class_id="boat", score=0.5)],
+    position=SEEN.point(), is_tracking=True, tracking_id="7",
+)  # fmt: skip
 PLACE = np.array([1.5, -2.5, 3.5], np.float32)
 ARRAYS: dict[str, tuple[str, Any, dict[str, Any]]] = {  # type: field of the array, an item, what else is expected
     "ObjectArray": ("objects", pose_with("derived_object_msgs/msg/Object", id=7), {}),
@@ -218,7 +228,7 @@ ARRAYS: dict[str, tuple[str, Any, dict[str, Any]]] = {  # type: field of the arr
         ),
         {"score": 0.75, "covariance": True},
     ),
-    "SpatialDetectionArray": ("detections", SPATIAL, {}),
+    "SpatialDetectionArray": ("detections", SPATIAL, {"score": 0.5}),
     "BoundingBoxArray": (
         "boxes", pose_with("jsk_recognition_msgs/msg/BoundingBox", value=0.5, label=3), {"agent": None, "score": 0.5}
     ),
@@ -249,6 +259,13 @@ def test_objects(tmp_path: Path, name: str) -> None:
     assert rows.time_ns.tolist() == [START_NS + 250_000_000] * 2 and not rows.is_geodetic.any()
     np.testing.assert_array_equal(rows.score, [more.get("score", np.nan)] * 2)
     np.testing.assert_array_equal(rows.covariance_m2[0], [4, 1, 9] if more.get("covariance") else [np.nan] * 3)
+
+
+def test_objects_with_covariances(tmp_path: Path) -> None:
+    item = SEEN("derived_object_msgs/msg/ObjectWithCovariance", id=7, pose=SEEN.uncertain_pose())
+    message = SEEN("derived_object_msgs/msg/ObjectWithCovarianceArray", header=SEEN.header(), objects=[item])
+    rows, _ = read_ros(tmp_path, SEEN, message)
+    assert (rows.agent.tolist(), rows.first.tolist()) == (["7"], [1.5]) and rows.covariance_m2[0].tolist() == [4.0, 1.0, 9.0]
 
 
 def test_objects_that_are_searched_for_or_invalid_are_not_seen(tmp_path: Path) -> None:
