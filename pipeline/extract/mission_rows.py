@@ -4,6 +4,7 @@ import itertools
 from collections import Counter
 from collections.abc import Sequence
 from functools import partial
+from typing import Final
 
 import numpy as np
 
@@ -26,9 +27,16 @@ from pipeline.extract.thinning import ThinningConfig, is_seen, noise
 from pipeline.extract.transform_messages import LogTransforms
 from pipeline.extract.transforms import Limits
 from pipeline.extract.units import in_true_units
+from pipeline.logs.health import utc
 from pipeline.logs.reader import MissionLog
 from pipeline.suspicions import Suspicions, few
 from pipeline.tables import Frame
+
+_MAX_FAR_M: Final = 1e9
+"""Beyond the moon; squares of much larger numbers overflow further on."""
+_YEAR_S: Final = 365.25 * 86400
+_MAX_YEARS: Final = 100.0
+"""Nobody records a mission for longer; windows of centuries reach beyond the times that files can state."""
 
 
 def rows_in_frame(
@@ -45,6 +53,7 @@ def rows_in_frame(
     primary = "truth" if config.thinning.enabled and config.thinning.thin_from == "truth" else "detections"
     _check_any(primary, rows[primary], counts, suspicions)
     rows = without_unjoined(rows, primary, suspicions)
+    _check_span(primary, rows[primary])
     placing = Placing(config.frame, Limits(config.max_extrapolation_s, config.max_transform_gap_s))
     read_tree = partial(transforms.read, clock)
     if config.frame is None:
@@ -83,8 +92,9 @@ def _columns(parts: Sequence[Positions], counts: Counter[str]) -> Positions:
     counts["out_of_order"] += sum(int((part.time_ns < np.maximum.accumulate(part.time_ns)).sum()) for part in parts)
     rows = Positions.concatenate(list(parts) or [Rows().finish()])
     is_finite = np.isfinite(rows.first) & np.isfinite(rows.second)
-    # A latitude off the earth is as little a position as NaN.
+    # A latitude off the earth, or metres beyond the moon, are as little a position as NaN.
     is_finite &= ~rows.is_geodetic | ((np.abs(rows.first) <= 90) & (np.abs(rows.second) <= 360))
+    is_finite &= rows.is_geodetic | (np.maximum(np.abs(rows.first), np.abs(rows.second)) <= _MAX_FAR_M)
     counts["dropped_nonfinite"] += int((~is_finite).sum())
     rows = rows[is_finite]
     return rows[np.argsort(rows.time_ns, kind="stable")]
@@ -134,6 +144,16 @@ def _check_any(role: str, rows: Positions, counts: Counter[str], suspicions: Sus
     else:
         raise NothingDetectedError(f"the topics mapped as {role} hold no position; map another topic (cadence info lists them)")
     raise InputError(reason)
+
+
+def _check_span(role: str, rows: Positions) -> None:
+    """`InputError` where sorted rows span more time than any mission."""
+    years = float(rows.time_ns[-1] - rows.time_ns[0]) * 1e-9 / _YEAR_S
+    if years > _MAX_YEARS:
+        raise InputError(
+            f"the {role} span {years:.0f} years, by {utc(int(rows.time_ns[0]))} to {utc(int(rows.time_ns[-1]))}; choose a part "
+            "with extract.start and extract.end, or state where their time is with time in their [extract] entries"
+        )
 
 
 def _placed(role: str, rows: Positions, frame: Frame, counts: Counter[str], apart: set[str]) -> Positions:

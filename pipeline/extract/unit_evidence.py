@@ -92,7 +92,7 @@ def of_metres(rows: Positions) -> Evidence | None:
     rows = rows[np.isfinite(rows.first) & np.isfinite(rows.second) & ~rows.is_geodetic]
     if len(rows) < 2:
         return None
-    radius_m = np.sqrt(rows.first**2 + rows.second**2 + np.nan_to_num(rows.z_m) ** 2)
+    radius_m = np.hypot(np.hypot(rows.first, rows.second), np.nan_to_num(rows.z_m))
     is_utm = (rows.first > _UTM_EASTING_M[0]) & (rows.first < _UTM_EASTING_M[1]) & (np.abs(rows.z_m) < _MAX_HEIGHT_M)
     is_on_ground = (radius_m > MIN_RADIUS_M) & (radius_m < MAX_RADIUS_M)
     if np.mean(is_on_ground) >= _MOST and not is_utm.all() and np.isfinite(rows.z_m).all():

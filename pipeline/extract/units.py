@@ -76,7 +76,7 @@ def _named_centre(rows: Positions) -> Positions:
     is_named = are_earth_centred(rows)
     if not is_named.any():
         return rows
-    radius_m = np.sqrt(rows.first**2 + rows.second**2 + rows.z_m**2)
+    radius_m = np.hypot(np.hypot(rows.first, rows.second), rows.z_m)
     return _from_centre(rows, is_named & (radius_m > MIN_RADIUS_M) & (radius_m < _MAX_ORBIT_M))
 
 

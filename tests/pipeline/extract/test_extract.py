@@ -162,6 +162,14 @@ def test_bad_positions_are_skipped_and_counted(tmp_path: Path, capsys: pytest.Ca
     fails(tmp_path / "earth", mkdir(tmp_path / "earth", bad[3:]), InputError, "off the earth")
 
 
+def test_numbers_that_nothing_can_mean_are_refused_in_one_line(tmp_path: Path) -> None:
+    far = [detection(5.0 + i, 1e300, 5.0) for i in range(5)]
+    assert run(mk(tmp_path / "some"), [*line(), *far]).summary["dropped_nonfinite"] == 5
+    fails(mk(tmp_path / "all"), far, InputError, "off the earth")
+    ages = [detection(1e8 * i, 3.0 * i, 0.0) for i in range(61)]
+    fails(mk(tmp_path / "ages"), ages, InputError, "the detections span 190 years, by 2023.* choose a part with extract.start")
+
+
 def mkdir(folder: Path, rows: list[Row]) -> list[Row]:
     folder.mkdir()
     return rows
