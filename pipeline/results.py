@@ -165,7 +165,7 @@ def _window(group: list[dict[str, object]], rows: _Rows, path: Path) -> WindowHy
             np.array_equal(column[begin:end], column[first[0] : first[1]])
             for column in (rows.hypothesis, rows.weight, rows.step_ns, rows.origin)
         )
-        if not same or len(np.unique(rows.datum_m[begin:end], axis=0)) != 1:
+        if not same or (rows.datum_m[begin:end] != rows.datum_m[begin]).any():
             raise InputError(
                 f"{path}: window {number} does not hold the same hypotheses for every agent; run infer with --force"
             )

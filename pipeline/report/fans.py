@@ -15,8 +15,8 @@ QUANTA = 32_000
 
 FAN_OVERHEAD_BYTES = 64
 STRAND_BYTES = 14
-STRANDS_A_VERTEX = 2
-"""Bands of hypotheses that go several ways stand side by side at their steps; two are room enough."""
+STRANDS_A_VERTEX = 1.5
+"""Bands of hypotheses that go several ways stand side by side at their steps: so many are room enough."""
 BASE64_GROWTH = 4 / 3
 
 

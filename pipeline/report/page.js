@@ -54,7 +54,7 @@
   // ---- state ---------------------------------------------------------------
   const canvas = byId("map"), pen = canvas.getContext("2d");
   const slider = byId("window"), readout = byId("readout"), moment = byId("moment"), playButton = byId("play");
-  const state = { window: 0, x: 0, y: 0, scale: 1, agents: new Set([...data.agents.keys()].filter((agent) => !data.unlikely.includes(agent))), timer: 0, isPrinting: false, span: data.shown_share };
+  const state = { window: 0, x: 0, y: 0, scale: 1, agents: new Set([...data.agents.keys()].filter((agent) => !data.unlikely.includes(agent))), timer: 0, isPrinting: false, isWhole: false, span: data.shown_share };
   const isHidden = (owner) => shownOf.has(owner) && !state.agents.has(shownOf.get(owner));
   const layers = {};
   for (const box of document.querySelectorAll("[data-layer]")) {
@@ -118,16 +118,19 @@
     state.scale = Math.min((width - 70) / wide, (height - 90) / high);
     draw();
   }
+  // Where everything was seen, and the bands of the window shown: they follow the window until somebody moves the map.
   function fitAll() {
+    state.isWhole = true;
     const box = extent();
     for (const points of [detections, truth]) {
       if (points) for (let i = 0; i < points.time.length; i++) grow(box, points.position[2 * i], points.position[2 * i + 1]);
     }
     // Of agents that are rather none nothing is known.
-    for (const fan of fans) if (likelihood(fan) >= 0.5) growByFan(box, fan);
+    for (const fan of fans) if (fan.window === state.window && likelihood(fan) >= 0.5) growByFan(box, fan);
     show(box);
   }
   function fitWindow(only) {
+    state.isWhole = false;
     const box = extent();
     for (const agent of only === undefined ? state.agents : [only]) {
       const fan = fanAt.get(state.window * 65536 + agent);
@@ -135,7 +138,13 @@
     }
     show(box);
   }
+  function move(x, y) {
+    state.isWhole = false;
+    state.x += x / state.scale; state.y += y / state.scale;
+    draw();
+  }
   function zoom(factor, x = width / 2, y = height / 2) {
+    state.isWhole = false;
     const scale = Math.min(Math.max(state.scale * factor, 1e-6), 1e4);
     state.x += (x - width / 2) * (1 / state.scale - 1 / scale);
     state.y -= (y - height / 2) * (1 / state.scale - 1 / scale);
@@ -494,7 +503,7 @@
       const x = (Number(chart.dataset.left) + seconds * Number(chart.dataset.scale)).toFixed(1), cursor = chart.querySelector(".cursor");
       cursor.setAttribute("transform", `translate(${x - Number(chart.dataset.left)} 0)`); cursor.setAttribute("visibility", "visible");
     }
-    draw();
+    if (state.isWhole) fitAll(); else draw();
   }
   function nearestWindow(seconds) {
     let best = 0;
@@ -538,7 +547,7 @@
     if (before) {
       const other = [...held].find(([id]) => id !== event.pointerId)?.[1];
       if (other) zoom(Math.hypot(x - other[0], y - other[1]) / Math.max(Math.hypot(before[0] - other[0], before[1] - other[1]), 1), other[0], other[1]);
-      else { state.x -= (x - before[0]) / state.scale; state.y += (y - before[1]) / state.scale; draw(); }
+      else move(before[0] - x, y - before[1]);
       held.set(event.pointerId, [x, y]);
     }
     const east = state.x + (x - width / 2) / state.scale, north = state.y - (y - height / 2) / state.scale;
@@ -549,7 +558,7 @@
   canvas.addEventListener("dblclick", (event) => zoom(2, ...place(event)));
   const keys = { "+": () => zoom(1.3), "=": () => zoom(1.3), "-": () => zoom(1 / 1.3), 0: fitAll, " ": () => play(!state.timer), ",": () => setWindow(state.window - 1), ".": () => setWindow(state.window + 1) };
   for (const [key, dx, dy] of [["ArrowLeft", -1, 0], ["ArrowRight", 1, 0], ["ArrowUp", 0, 1], ["ArrowDown", 0, -1]]) {
-    keys[key] = () => { state.x += (dx * 60) / state.scale; state.y += (dy * 60) / state.scale; draw(); };
+    keys[key] = () => move(60 * dx, 60 * dy);
   }
   canvas.addEventListener("keydown", (event) => { if (keys[event.key] && !event.ctrlKey && !event.metaKey) { event.preventDefault(); keys[event.key](); } });
 

@@ -37,7 +37,7 @@ def moments_section(mission: Mission, analysis: Analysis, moments: Sequence[Mome
         strands = strands_of(fan, shape_of(fan), mission.solid)
         words = [f"{mission.called(fan.agent, [row] if row else [])} at {clock.moment(fan.origin_ns)}"]
         words += [f"spread {metres(analysis.spread_now_m[moment.fan])}"]
-        words += [f"last seen {duration(abs(age))} before"] if age is not None else []
+        words += [f"last seen {duration(abs(round(age, 1)))} before"] if age is not None else []
         words += ["seen only once until then"] if row is not None and row.num_detections == 1 else []
         words += [f"a hypothesis is {metres(error_m)} from the truth"] if np.isfinite(error_m) else []
         words += _ways(strands, fan.origin_index)

@@ -105,7 +105,8 @@ def _doubts_of_truth(scored: Scored | str, speeds: Speeds) -> Iterator[str]:
             yield f"Bands {words} the moment are too narrow: {outside}."
         fast = scored.mean(part, "fast_track_share")
         if fast > _MANY_FAST and speeds.fastest_mps > _CLEARLY * scored.fastest_mps:
-            yield f"{100 * fast:.0f} % of the tracks {words} the moment hold a step faster than {speed(scored.fastest_mps)}."
+            share = f"{100 * fast:.0f} % of the tracks {words} the moment"
+            yield f"{share} hold a step faster than nearly every true one ({speed(scored.fastest_mps)})."
     if scored.every > 1:
         yield f"Only one window in {scored.every} was compared with the truth, to save time; cadence evaluate compares all."
 

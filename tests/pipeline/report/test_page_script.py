@@ -144,6 +144,11 @@ def test_the_map_is_moved_and_zoomed(open_page: Open) -> None:
     page.mouse("mouseWheel", x, y, deltaX=0, deltaY=-300)
     page.mouse("mouseMoved", x, y)
     assert place(page) == pytest.approx(moved_m, abs=0.11)  # the wheel keeps the place under the pointer
+    slide(page, 5)
+    page.mouse("mouseMoved", x + 1, y)
+    page.mouse("mouseMoved", x, y)
+    assert place(page) == pytest.approx(moved_m, abs=0.11)  # what somebody looks at stays where it is
+    slide(page, 2)
     for button in ("#zoom-in", "#zoom-out", "#fit-window", "#fit-all"):
         before = picture(page)
         page.click(button)
