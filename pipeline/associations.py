@@ -19,6 +19,7 @@ from cadence.association.associate import associate
 from cadence.association.fitting import fit_habits
 from cadence.association.particles import Stream
 from cadence.association.presence import Habits
+from cadence.association.single import is_one_target
 from cadence.association.types import CLUTTER, AssociationConfig, AssociationHypotheses, agent_probability, without_unlikely
 from cadence.constraints.obstacles import Obstacles
 from cadence.errors import InputError
@@ -140,12 +141,15 @@ def tell_sources(
 ) -> Sources:
     """Names for detections without one, and the grid, whose step follows from the gaps of single agents.
 
-    With `config` None the nameless are one agent, UNKNOWN_AGENT.
+    With `config` None the nameless are one agent, UNKNOWN_AGENT. Where their number is unknown and one target explains them
+    all, they are one's.
     """
     planned = plan_grid(detections, grid)
     if config is None or detections["agent_id"].null_count == 0:
         return Sources(detections, planned, None)
     nameless = _Nameless.of(detections, default_sigma_m)
+    if config.num_agents is None and detections["agent_id"].null_count == detections.num_rows:
+        config = replace(config, num_agents=1 if is_one_target(nameless.stream, max_speed_mps) else None)
     habits = fit_habits(nameless.stream, config, seed, max_speed_mps)
     if grid.step_s is None:
         # A few particles tell how long gaps are.

@@ -23,6 +23,8 @@ _SMALLEST, _LARGEST = 1e-9, 1e9
 """A nanosecond to 30 years, an atom to beyond the moon: other numbers are typing errors, and overflow further on."""
 _LARGEST_SEED = 2**63 - 1
 
+_PLAIN = {float: "a number", int: "a whole number", str: "a text", bool: "true or false", Path: "a path"}
+
 TABLES = ("ingest", "extract", "infer", "export", "report", "evaluate", "simulate", "train")
 """The tables of a configuration file, one a stage. One file may hold all of them; each command reads its own."""
 
@@ -121,7 +123,11 @@ def _check_numbers(value: Any, where: str) -> None:
     if isinstance(value, Mapping | list | tuple):
         for key, item in value.items() if isinstance(value, Mapping) else enumerate(value):
             _check_numbers(item, f"{where}[{key}]" if isinstance(key, int) else f"{where}.{key}".lstrip("."))
-    elif isinstance(value, int | float) and math.isfinite(value) and value:
+    elif isinstance(value, float) and not math.isfinite(value):
+        # TOML has both; no key means anything by nan, and only a limit can be infinite: there is then none.
+        if math.isnan(value) or not where.rpartition(".")[2].startswith("max_"):
+            raise ConfigError(f"{where}: {value:g} is nothing that it can mean; give a number")
+    elif isinstance(value, int | float) and value:
         largest = _LARGEST_SEED if where.rpartition(".")[2] == "seed" else _LARGEST
         if not _SMALLEST <= abs(value) <= largest:
             raise ConfigError(f"{where}: {value:g} is beyond what it can mean, {_SMALLEST:g} to {largest:g}; correct it")
@@ -254,4 +260,6 @@ def _brief(value: Any) -> str:
 
 
 def _describe(hint: Any) -> str:
+    if hint in _PLAIN:
+        return _PLAIN[hint]
     return getattr(hint, "__name__", str(hint)) if typing.get_origin(hint) is None else str(hint)

@@ -46,7 +46,7 @@ class GridConfig:
     max_windows: int = 2000
 
     def __post_init__(self) -> None:
-        if self.step_s is not None and not self.step_s > 0:
+        if self.step_s is not None and not 0 < self.step_s < math.inf:
             raise ValueError(f"step_s must be positive, got {self.step_s}")
         if min(self.history_steps, self.stride_steps) < 1 or self.horizon_steps < 0:
             raise ValueError("history_steps and stride_steps must be at least 1, horizon_steps at least 0")

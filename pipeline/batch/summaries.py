@@ -123,10 +123,12 @@ def _assumptions(summary: Mapping[str, Any]) -> list[str]:
     if not num or "num_windows" not in summary:
         return []
     of = f" of {', '.join(list(unnamed)[:4])}{' and others' if len(unnamed) > 4 else ''}" if unnamed else ""
-    told = "were taken for one target" if found is None else f"were told apart as those of {found['num_agents']} targets"
+    num_agents = 1 if found is None else found["num_agents"]
+    told = "were taken for one target" if num_agents == 1 else f"were told apart as those of {num_agents} targets"
     paths = {path for path in unnamed.values() if path is not None}
     ways = [f'agent_path = "{path}" in [[extract.detections]] reads it from the messages' for path in sorted(paths)[:1]]
-    ways += ['agent = "NAME" there means one target', "infer.association.num_agents = N is how many there are"]
+    ways += ['agent = "NAME" there means one target'] * (num_agents != 1)
+    ways.append("infer.association.num_agents = N is how many there are")
     return [f"{num} detections{of} do not say whose they are and {told}; to have it otherwise: {', '.join(ways)}"]
 
 

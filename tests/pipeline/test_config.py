@@ -17,6 +17,7 @@ from pipeline.config import (
     read_config,
     read_settings,
 )
+from pipeline.export.config import ExportConfig
 from pipeline.forecast.stage import ForecastConfig
 from pipeline.infer.config import InferConfig
 from pipeline.train.config import TrainConfig
@@ -64,12 +65,12 @@ def test_values_reach_their_fields_with_their_types():
     [
         ({}, "key 'name' is missing"),
         ({"name": "n", "cuont": 1}, r"unknown key 'cuont' \(did you mean 'count'\?\); known keys: name, count, is_on"),
-        ({"name": 1}, r"config\.name: expected str, got 1"),
-        ({"name": "n", "count": 1.5}, r"config\.count: expected int, got 1\.5"),
-        ({"name": "n", "count": True}, r"config\.count: expected int, got True"),
-        ({"name": "n", "is_on": 1}, r"config\.is_on: expected bool, got 1"),
-        ({"name": "n", "sizes_m": [1, "x"]}, r"config\.sizes_m\[1\]: expected float, got 'x'"),
-        ({"name": "n", "sizes_m": [float("nan")]}, r"config\.sizes_m\[0\]: expected float, got nan"),
+        ({"name": 1}, r"config\.name: expected a text, got 1"),
+        ({"name": "n", "count": 1.5}, r"config\.count: expected a whole number, got 1\.5"),
+        ({"name": "n", "count": True}, r"config\.count: expected a whole number, got True"),
+        ({"name": "n", "is_on": 1}, r"config\.is_on: expected true or false, got 1"),
+        ({"name": "n", "sizes_m": [1, "x"]}, r"config\.sizes_m\[1\]: expected a number, got 'x'"),
+        ({"name": "n", "sizes_m": [float("nan")]}, r"config\.sizes_m\[0\]: expected a number, got nan"),
         ({"name": "n", "pair": [1]}, r"config\.pair: expected tuple"),
         ({"name": "n", "inner": {"kind": "c"}}, r"config\.inner\.kind: 'c' is not one of a, b"),
         ({"name": "n", "inner": {"ratio": -1}}, r"config\.inner: ratio is -1\.0"),
@@ -174,9 +175,17 @@ def test_numbers_that_no_setting_can_mean_are_refused(number):
         read_settings(Outer, {"rows": [{"ratio": 1.0}, {"ratio": parse_override(f"a={number}")[1]}]}, "")
 
 
-def test_numbers_at_the_limits_seeds_and_no_limit_at_all_are_settings():
-    config = read_settings(Outer, {"name": "n", "count": 10**9, "inner": {"ratio": float("inf")}, "sizes_m": [1e-9, 0]}, "")
-    assert config.count == 10**9 and config.inner.ratio == float("inf") and config.sizes_m == (1e-9, 0.0)
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
+def test_what_is_no_number_is_refused_but_for_limits_without_limit(value):
+    with pytest.raises(ConfigError, match=r"^infer\.grid\.step_s: \S+ is nothing that it can mean; give a number$"):
+        read_settings(Outer, {"grid": {"step_s": value}}, "infer")
+    if value > 0:
+        assert read_settings(ExportConfig, {"max_scene_mb": value}, "export").max_scene_mb == value
+
+
+def test_numbers_at_the_limits_and_seeds_are_settings():
+    config = read_settings(Outer, {"name": "n", "count": 10**9, "inner": {"ratio": 1e9}, "sizes_m": [1e-9, 0]}, "")
+    assert config.count == 10**9 and config.inner.ratio == 1e9 and config.sizes_m == (1e-9, 0.0)
     with pytest.raises(ConfigError, match="unknown key 'seed'"):  # its size was no reason to refuse it
         read_settings(Outer, {"seed": 2**63 - 1}, "")
 
