@@ -101,6 +101,12 @@ class ChannelReader:
             self.rows.sensors.append(self._identity("sensor", values["sensor"], place))
             self.rows.frame_ids.append(values["frame_id"] or "")
 
+    @property
+    def what(self) -> tuple[str, ...]:
+        """What it reads: the paths of positions, and the conditions on them."""
+        paths = [path.text for position in self.positions for field in position for path in field.paths]
+        return (*paths, *(term.text for term in self.conditions.terms))
+
     def field_columns(self) -> FieldColumns:
         """What reads the source's fields of many messages at once; `UndecodableChannel` where that cannot be done."""
         if self.alternatives != "first" or self.json_text or self.conditions.name_constants:

@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 from scipy.spatial import cKDTree
 
-from cadence.arrays import Bools, Int64s, Objects
+from cadence.arrays import Bools, Float64s, Int64s, Objects
 from pipeline.extract.covariances import are_apart
 from pipeline.extract.positions import Positions
 from pipeline.suspicions import Suspicions, listed
@@ -24,6 +24,11 @@ _FRESH: Final = 0.8
 """Of at least so many names: where more stand in one message each, names are counted anew for each message."""
 _FRESH_MPS: Final = 100.0
 """Unless the next message has nothing near: many ships that are heard once each are far from each other."""
+_EXCHANGED: Final = 0.3
+_FURTHER: Final = 3.0
+_MIN_EXCHANGED_M: Final = 10.0
+_MAX_BEND_MPS2: Final = 10.0
+"""One g: names that go from target to target bend by more, in three of ten messages."""
 _FILL_INS: Final = {"4294967295", "2147483647", "18446744073709551615", "9223372036854775807"}
 _CLASSES: Final = {
     "person", "persons", "people", "pedestrian", "human", "man", "woman", "child", "car", "vehicle", "truck", "bus", "van",
@@ -78,7 +83,9 @@ def _faults(rows: Positions, is_stated: bool) -> Iterator[tuple[Bools, str]]:
         chosen = list(itertools.compress(names, is_chosen))
         if chosen:
             yield np.array(is_chosen)[rows.agents.number], f"{listed(chosen)} {'are' if len(chosen) > 1 else 'is'} {why}"
-    if _are_fresh(rows):
+    if _are_exchanged(rows):
+        yield np.ones(len(rows), np.bool_), "names change places from message to message"
+    elif _are_fresh(rows):
         yield np.ones(len(rows), np.bool_), f"{len(names)} names for {len(rows)} detections: they are new in each message"
 
 
@@ -99,17 +106,48 @@ def _are_fresh(rows: Positions) -> bool:
     return float(np.median(_speeds_mps(rows, message))) < _FRESH_MPS
 
 
+def _are_exchanged(rows: Positions) -> bool:
+    """Whether what bears a name in the next message is, as a rule, another target, while its own is near.
+
+    The names of targets that move on together stay smooth, however near others come to their places.
+    """
+    if not (np.diff(rows.message) == 0).any() or len(rows) < _MIN_FRESH:
+        return False
+    order = np.lexsort((rows.time_ns, rows.agents.number))
+    name, place = rows.agents.number[order], (rows.first + 1j * rows.second)[order]
+    step_s, is_next = np.diff(rows.time_ns[order]) * 1e-9, np.diff(name) == 0
+    bend_m, is_triple = np.abs(np.diff(place, 2)), is_next[1:] & is_next[:-1]
+    is_rough = is_triple & (bend_m > _MAX_BEND_MPS2 * np.minimum(step_s[1:], step_s[:-1]) ** 2) & (bend_m > _MIN_EXCHANGED_M)
+    if is_rough.sum() <= _EXCHANGED * len(rows):
+        return False
+    own_m = np.full(len(rows), np.nan)
+    own_m[order[:-1]] = np.where(is_next, np.abs(np.diff(place)), np.nan)
+    messages, message = np.unique(rows.message, return_inverse=True)
+    if len(messages) < _MIN_FRESH:
+        return False
+    by_message, nearest_m, _ = _nearest(rows, message)
+    is_other = own_m[by_message] > np.maximum(_MIN_EXCHANGED_M, _FURTHER * nearest_m)
+    return bool(is_other.sum() > _EXCHANGED * len(rows))
+
+
 def _speeds_mps(rows: Positions, message: Int64s) -> np.ndarray:
     """How fast the nearest position of the next message would have been reached from each row [N] that has a next message."""
+    _, distance_m, time_s = _nearest(rows, message)
+    return distance_m / np.maximum(time_s, 1e-3)
+
+
+def _nearest(rows: Positions, message: Int64s) -> tuple[Int64s, Float64s, Float64s]:
+    """The rows that have a next message, how far its nearest position is from each, and how much later."""
     order = np.argsort(message, kind="stable")
     place = np.column_stack([rows.first, rows.second])[order]
     time_s = (rows.time_ns[order] - rows.time_ns[0]) * 1e-9
     borders = np.flatnonzero(np.diff(message[order], prepend=-1))
-    found = []
+    distances_m, times_s = [], []
     for first, last, end in zip(borders[:-1], borders[1:], [*borders[2:], len(order)], strict=True):
         distance_m, nearest = cKDTree(place[last:end]).query(place[first:last])
-        found.append(distance_m / np.maximum(np.abs(time_s[last + nearest] - time_s[first:last]), 1e-3))
-    return np.concatenate(found)
+        distances_m.append(distance_m)
+        times_s.append(np.abs(time_s[last + nearest] - time_s[first:last]))
+    return order[: borders[-1]], np.concatenate(distances_m), np.concatenate(times_s)
 
 
 def _without_shared(rows: Positions, naming: Naming, tolerance_ns: int, suspicions: Suspicions) -> Positions:

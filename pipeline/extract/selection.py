@@ -1,7 +1,8 @@
 """Which sources serve which role for one log: what the user states, and what the channels suggest for the rest."""
 
 import fnmatch
-from collections.abc import Mapping, Sequence
+import itertools
+from collections.abc import Hashable, Mapping, Sequence
 
 from cadence.errors import ConfigError, InputError, NothingDetectedError
 from pipeline.extract.channel_reader import ChannelReader
@@ -58,9 +59,17 @@ def select_readers(
         raise failure(_no_detections(suggested, channels))
     readers = []
     for role in ROLES:
-        for source in chosen[role]:
-            readers += _readers(role, source, chosen[role], bool(stated[role]), channels)
+        found = [_readers(role, source, chosen[role], bool(stated[role]), channels) for source in chosen[role]]
+        readers += _once(list(itertools.chain.from_iterable(found)))
     return tuple(readers)
+
+
+def _once(readers: Sequence[ChannelReader]) -> list[ChannelReader]:
+    """One reader for what a channel says at the same paths: of patterns that overlap, that with fewest names is meant."""
+    found: dict[Hashable, ChannelReader] = {}
+    for reader in sorted(readers, key=lambda reader: reader.source.topic.count("{")):
+        found.setdefault((reader.channel.id, reader.what), reader)
+    return [reader for reader in readers if found[reader.channel.id, reader.what] is reader]
 
 
 def unused_channels(readers: Sequence[ChannelReader], channels: Sequence[Channel]) -> dict[str, str]:

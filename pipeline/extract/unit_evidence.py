@@ -84,7 +84,9 @@ def of_degrees(rows: Positions) -> Evidence | None:
     if len(rows) < 2:
         return None
     seen = f"latitudes {_range(rows.first)}, longitudes {_range(rows.second)}"
-    return _of_whole_numbers(rows, seen) or _of_far_numbers(rows, seen) or _of_radians(rows, seen)
+    return (
+        _of_whole_numbers(rows, seen) or _of_far_numbers(rows, seen) or _of_radians(rows, seen) or _of_cut_numbers(rows, seen)
+    )
 
 
 def of_metres(rows: Positions) -> Evidence | None:
@@ -160,6 +162,13 @@ def _of_radians(rows: Positions, seen: str) -> Evidence | None:
     seen += ": off Africa, where no land is, or anywhere if these are radians"
     seen += "" if speed_mps is None else f" ({speed_mps:.3g} m/s in degrees, {radian_mps:.3g} m/s in radians)"
     return Evidence(seen, "rad", "read as radians", 'unit = "rad" or "deg"')
+
+
+def _of_cut_numbers(rows: Positions, seen: str) -> Evidence | None:
+    """Whole degrees, of which the decimals were lost: each is a hundred kilometres wide."""
+    if len(rows) < _MIN_ROWS or (rows.first % 1 != 0).any() or (rows.second % 1 != 0).any():
+        return None
+    return Evidence(f"{seen}, all without decimals", "as they are", "used as they stand", 'unit = "deg"')
 
 
 def _of_far_metres(rows: Positions, radius_m: Float64s) -> Evidence | None:

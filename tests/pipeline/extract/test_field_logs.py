@@ -46,6 +46,16 @@ def test_one_topic_with_two_types_is_never_mixed(tmp_path: Path) -> None:
     fails(tmp_path / "both", rows, InputError, r"frames: /target/position \(latitude and longitude\), /target/position")
 
 
+def test_patterns_that_overlap_read_a_topic_once(tmp_path: Path) -> None:
+    """`/radar/contacts/{agent}`, and `/{sensor}/contacts/{agent}` for the camera's, which means the radar's as well."""
+    topics = ("/radar/contacts/v1", "/camera/contacts/v1")
+    rows = [pose_row(i + 0.2 * k, 5.0 * i, topic) for i in range(8) for k, topic in enumerate(topics)]
+    found = run(tmp_path, rows)
+    assert sorted(found.detections["topic"].to_pylist()) == sorted(8 * topics)
+    pasted = [{"topic": "/radar/contacts/{agent}"}, {"topic": "/{sensor}/contacts/{agent}"}]
+    assert run(tmp_path, rows, detections=pasted).detections.equals(found.detections)
+
+
 def test_a_set_point_is_no_detection(tmp_path: Path) -> None:
     """What an autopilot is told to reach has a name like that of what it looks for."""
     rows = [

@@ -97,3 +97,23 @@ def test_kinds_are_names_where_the_user_says_so_and_each_is_one_target() -> None
     assert not suspicions and judged(rows(*alone))[0] == [None] * 40
     shared = [(i, float(i), 2.0 * i, y, "boat") for i in range(20) for y in (0.0, 90.0)]
     assert without_false_names(rows(*shared), 0.001, naming, suspicions).agent.tolist() == [None] * 40
+
+
+def scene(place_of: object, names: int = 6, num: int = 40) -> list[Item]:
+    return [(i, i / 2, *map(float, place_of(i, k)), str(k)) for i in range(num) for k in range(names)]  # type: ignore[operator]
+
+
+def test_names_that_change_places_are_nobody() -> None:
+    rng = np.random.default_rng(0)
+    order = [rng.permutation(6) for _ in range(40)]
+    names, (line,) = judged(rows(*scene(lambda i, k: (5.0 * i, 20.0 * order[i][k]))))
+    assert set(names) == {None} and "names change places from message to message" in line
+
+
+@pytest.mark.parametrize("noise_m", [0.0, 2.0, 15.0])
+def test_a_column_of_cars_keeps_its_names(noise_m: float) -> None:
+    """Each comes to where the one before it was."""
+    rng = np.random.default_rng(0)
+    noise = rng.normal(0, max(noise_m, 1e-9), (40, 6, 2))
+    found = rows(*scene(lambda i, k: (20.0 * (i - k), 0.0) + noise[i, k]))
+    assert judged(found) == (found.agent.tolist(), [])

@@ -95,6 +95,11 @@ def test_whole_numbers_of_which_power_nobody_knows(tmp_path: Path, scale: float)
     assert told.summary["suspicions"] == [] and where(told)[0] == pytest.approx(48.1 * scale / 1e7, rel=1e-3)
 
 
+def test_degrees_without_decimals_are_named(tmp_path: Path) -> None:
+    (suspicion,) = run(tmp_path, [fix(float(i), 48.0, 11.0) for i in range(30)]).summary["suspicions"]
+    assert "all without decimals" in suspicion["seen"]
+
+
 def minutes(degrees: float) -> float:
     """Degrees and minutes in one number."""
     return np.trunc(degrees) * 100 + (degrees - np.trunc(degrees)) * 60
