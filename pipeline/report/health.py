@@ -123,4 +123,4 @@ def _channels(mission: Mission) -> str:
     )
     numeric = [heads.index(key) for key in ("num_messages", "mean_rate_hz")]
     body = table([key.replace("_", " ") for key in heads], rows, numeric)
-    return f"<details><summary>{len(channels)} channels</summary>{body}{rest}</details>"
+    return f"<details><summary>{len(channels)} channel{'s' if len(channels) > 1 else ''}</summary>{body}{rest}</details>"

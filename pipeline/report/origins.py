@@ -82,7 +82,7 @@ def origins_section(
         return ""
     clock = Clock(start_ns, end_ns)
     rows = [_row(agent, presence.get(agent.agent_id), origins.num_detections, clock) for agent in origins.agents]
-    heads = ["agent", "there at best", "detections", "90 % sure", "expected number", "first", "last"]
+    heads = ["agent", "there at best", "detections", "of these 90 % sure", "expected", "first", "last"]
     content = table(heads, rows[:OPEN_ROWS], numeric=(1, 2, 3, 4))
     if len(rows) > OPEN_ROWS:
         rest = table(heads, rows[OPEN_ROWS:MAX_ROWS], numeric=(1, 2, 3, 4))
@@ -94,7 +94,7 @@ def origins_section(
         f"are rather nobody’s. Of {sure:,} it is at least 90 % sure whose they are, as known at the end of the log. Hypotheses "
         "differ in whose the others are; elsewhere on this page each is shown with its likeliest agent."
     )
-    return section("Agents of unknown origin", content, lead)
+    return section("Agents that were found", content, lead)
 
 
 def _row(agent: FoundAgent, chance: float | None, num_detections: int, clock: Clock) -> Sequence[str]:

@@ -99,8 +99,8 @@ def uncertainty_section(mission: Mission, analysis: Analysis) -> str:
         ('<rect class="void" x="3" y="2" width="20" height="12"/>', "windows without hypotheses"),
     )
     lead = (
-        "How far hypotheses are from their middle (root mean square), window after window; each line of the grid is ten times "
-        "the one below it, the same for all agents."
+        "How far hypotheses are from their middle (root mean square), window after window, in powers of ten, on the same "
+        "scale for all agents."
     )
     if len(agents) > 1:
         name = mission.called(agents[0], [row for row in mission.rows if row.agent == agents[0]])

@@ -259,7 +259,7 @@ def test_side_file_and_page_tell_of_agents_and_sources(tmp_path: Path, monkeypat
         assert series in layout
     report(directory, ReportConfig(), QUIET)
     page = (directory / "report.html").read_text()
-    assert "Agents of unknown origin" in page and f"{int((true == 0).sum())} of {len(true)}" in page
+    assert "Agents that were found" in page and f"{int((true == 0).sum())} of {len(true)}" in page
 
 
 def slow(table: pa.Table) -> pa.Table:

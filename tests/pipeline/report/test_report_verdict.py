@@ -213,7 +213,7 @@ def test_the_table_of_found_agents_tells_how_likely_each_is(tmp_path: Path, monk
     directory = nameless(tmp_path, monkeypatch)
     report(directory, ReportConfig(), QUIET)
     page = (directory / "report.html").read_text()
-    table = page.partition("Agents of unknown origin")[2].partition("</table>")[0]
+    table = page.partition("Agents that were found")[2].partition("</table>")[0]
     assert "there at best" in table and table.count("&gt; 99 %") == 2
     assert "2 agents were found, 2 of them the likeliest source" in table
     assert ">Agents</dt><dd>2<" in page.replace("<small></small>", "")
