@@ -26,7 +26,7 @@ SOURCES = sorted(
 FLOORS = {
     "cadence": (
         {"arrays", "errors", "schedule"},
-        {"constraints", "metrics", "resampling", "seeds"},
+        {"constraints", "measurement", "metrics", "resampling", "seeds"},
         {"association", "types"},
         {"bank", "recordings"},
         {"network", "worlds"},
@@ -37,6 +37,7 @@ FLOORS = {
     "pipeline": (
         {"documents", "out_of_memory", "suggestions"},
         {
+            "accuracies",
             "arrays",
             "config",
             "locks",

@@ -26,8 +26,8 @@ class ExtractConfig:
                      does not move, else the one that it moves in
     max_extrapolation_s   how long before its first and after its last sample a transform holds; later positions are refused
     max_transform_gap_s   longest time between two samples over which a transform is interpolated
-    default_sigma_m  standard deviation of detections that state none; without it that of their scatter about smooth ways, where
-                     there is one, else they count as exact
+    default_sigma_m  standard deviation of detections that state none; without it that of their own likelihood, where they show
+                     any noise, else they count as exact
     max_speed_mps    single positions that could only be reached and left again faster are recorder faults (see `spikes`)
     trusted          kinds of suspicion that are not looked for: what the log says of them counts as it stands (docs/formats.md)
     is_strict        refuse a log of which something is suspected (`--strict`)

@@ -11,7 +11,9 @@ from typing import Any
 import numpy as np
 
 from cadence.errors import ConfigError, ImplausibleInputError, InputError
+from pipeline.accuracies import Accuracy, lines
 from pipeline.catalogue import open_catalogued_log, read_catalogue
+from pipeline.extract.accuracy import with_accuracy
 from pipeline.extract.channel_reader import ChannelReader
 from pipeline.extract.collapse import Collapsed, collapse
 from pipeline.extract.config import ExtractConfig
@@ -19,7 +21,6 @@ from pipeline.extract.mission_rows import rows_in_frame
 from pipeline.extract.obstacle_sources import collect_obstacles
 from pipeline.extract.positions import Positions
 from pipeline.extract.reading import read_positions
-from pipeline.extract.scatter import with_scatter
 from pipeline.extract.selection import select_readers, selected_channels, unused_channels
 from pipeline.extract.stamps import moment_ns
 from pipeline.extract.summary import summarise, tell
@@ -66,8 +67,8 @@ def write_tables(log: MissionLog, folder: Path, config: ExtractConfig, progress:
         counts = read_positions(log, readers, progress, *_cut_ns(log, config), config.max_detections)
         rows, frame = rows_in_frame(log, readers, config, counts, suspicions, transforms)
     counts["unselected_topics"] = len({c.topic for c in log.channels} - {c.topic for c in channels})
-    scattered, sigmas_m = _with_accuracy(rows["detections"], readers, config, suspicions)
-    detections = collapse(scattered, config.simultaneity_s)
+    accurate, accuracies = _with_accuracy(rows["detections"], readers, config, suspicions)
+    detections = collapse(accurate, config.simultaneity_s)
     counts["disagreeing"] = detections.num_disagreeing
     _suspect_disagreement(detections, suspicions)
     counts["collapsed"] = len(rows["detections"]) - len(detections.positions) - detections.num_disagreeing
@@ -83,11 +84,9 @@ def write_tables(log: MissionLog, folder: Path, config: ExtractConfig, progress:
     write_obstacles(folder / OBSTACLES_NAME, obstacles)
     unused = unused_channels(readers, channels)
     tell(counts, suspicions, detections.positions, log, progress)
-    for topic, sigma_m in sigmas_m.items():
-        progress.note(
-            f"extract: {topic} states no accuracy, but its detections scatter by {sigma_m:.3g} m, which is taken as their "
-            "standard deviation; sigma_m in its [[extract.detections]] states another"
-        )
+    records = [accuracy.record() for accuracy in accuracies]
+    for line in few(lines(records)):
+        progress.note(f"extract: {line}")
     for channel, why in unused.items():
         progress.note(f"extract: {channel} may hold detections and is not used: {why}")
     transforms.tell()
@@ -99,7 +98,7 @@ def write_tables(log: MissionLog, folder: Path, config: ExtractConfig, progress:
         refused = "; ".join(few(suspicions.lines()))
         raise ImplausibleInputError(f"{log.path}: refused by --strict, as something in it is suspected: {refused}")
     summary = summarise(log, readers, detections.positions, truth, poses, frame, counts, suspicions, len(obstacles))
-    return summary | {"scatter_sigma_m": sigmas_m, "unused": unused, "transforms": transforms.summary(counts)}
+    return summary | {"accuracy": records, "unused": unused, "transforms": transforms.summary(counts)}
 
 
 @contextlib.contextmanager
@@ -133,12 +132,11 @@ def _suspect_disagreement(detections: Collapsed, suspicions: Suspicions) -> None
 
 def _with_accuracy(
     rows: Positions, readers: Sequence[ChannelReader], config: ExtractConfig, suspicions: Suspicions
-) -> tuple[Positions, dict[str, float]]:
-    """Detections with a covariance where they state none and the user or their scatter does; the latter's sigma by topic."""
-    found: dict[str, float] = {}
-    if not config.thinning.enabled:  # what is thinned is as exact as the truth, and its noise is stated
-        told = {reader.channel.topic for reader in readers if reader.source.sigma_m is not None}
-        rows, found = with_scatter(rows, told, config.default_sigma_m is not None, suspicions)
+) -> tuple[Positions, list[Accuracy]]:
+    """Detections with a covariance where they state none, and the user or their likelihood does; what the latter found."""
+    stated = {reader.channel.topic for reader in readers if reader.source.sigma_m is not None}
+    kinds = {reader.channel.topic: reader.channel.schema_name for reader in readers}
+    rows, found = with_accuracy(rows, stated, config.default_sigma_m is not None, kinds, suspicions)
     if config.default_sigma_m is None:
         return rows, found
     covariance = rows.covariance_m2.copy()

@@ -151,7 +151,7 @@ def _of(name: str, log: MissionLog) -> Diagnosis:
     if not health.has_checksums:
         container.append("Some chunks have no checksum: changed bytes inside messages could not be noticed.")
     undecodable = tuple(channel.reason for channel in survey_channels(log) if channel.reason)
-    use, no_use = _use_of(log)
+    use, no_use = use_of(log)
     suspicions = tuple(suspicions_in(use))
     verdict: Verdict = "partial" if not health.is_complete else "faulty" if health.problems else "sound"
     is_joined = log.num_recordings > len(log.parts)
@@ -171,7 +171,7 @@ def _of(name: str, log: MissionLog) -> Diagnosis:
     )  # fmt: skip
 
 
-def _use_of(log: MissionLog) -> tuple[Mapping[str, Any], str]:
+def use_of(log: MissionLog) -> tuple[Mapping[str, Any], str]:
     """What the stage extract makes of the log by default, and why it makes nothing."""
     with tempfile.TemporaryDirectory() as folder:
         try:

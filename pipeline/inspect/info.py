@@ -4,11 +4,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from pipeline.accuracies import lines
 from pipeline.catalogue import CatalogueChannel
 from pipeline.ingest.stage import survey_channels
+from pipeline.inspect.doctor import use_of
 from pipeline.logs.parts import recorded_parts
 from pipeline.logs.reader import Health, open_log, open_parts, utc
 from pipeline.mapping.guess import suggest_mapping
+from pipeline.suspicions import few
 
 _MAX_CHANNELS = 200
 _UNITS = ("bytes", "kB", "MB", "GB", "TB")
@@ -18,7 +21,10 @@ _IS_NUMBER = (False, False, False, True, True, True, False)
 
 @dataclass(frozen=True)
 class LogDescription:
-    """What `describe_log` found; times are log times, `roles` maps topics to what they look like."""
+    """What `describe_log` found; times are log times, `roles` maps topics to what they look like.
+
+    `accuracy` is what detections tell of theirs where messages do not.
+    """
 
     path: Path
     size_bytes: int
@@ -31,6 +37,7 @@ class LogDescription:
     health: Health
     suggested_mapping: str
     roles: dict[str, str] = field(default_factory=dict)
+    accuracy: tuple[str, ...] = ()
 
 
 def describe_log(path: Path | str) -> LogDescription:
@@ -50,6 +57,7 @@ def describe_log(path: Path | str) -> LogDescription:
         health=log.health,
         suggested_mapping=suggested.to_toml(),
         roles=dict(suggested.roles),
+        accuracy=tuple(lines(use_of(log)[0].get("accuracy", []))),
     )
 
 
@@ -63,6 +71,9 @@ def render(description: LogDescription) -> str:
     notes = [f"  {channel.reason}" for channel in description.channels if channel.reason]
     if notes:
         parts.append("\n".join(["Not decodable (such channels are left out):", *notes]))
+    if description.accuracy:
+        told = "".join(f"\n  {line}" for line in few(description.accuracy))
+        parts.append(f"Accuracy of the detections, where messages do not state it:{told}")
     if description.suggested_mapping:
         parts.append(f"Settings that fit; put them into a file and give it with --config:\n\n{description.suggested_mapping}")
     else:

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
+from pipeline.accuracies import in_words
 from pipeline.logs.reader import Health
 from pipeline.report.clock import Clock, duration
 from pipeline.report.markup import flatten, label, pairs, section, table, text
@@ -69,14 +70,12 @@ def _extraction(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
     rows = [(text(words), text(count)) for words, count in counted.items() if count]
     if counted and not rows:
         rows = [("left out", "nothing")]
-    scatter = summary.get("scatter_sigma_m") or {}
-    rows += [
-        ("accuracy, by the scatter of the detections", text(f"{topic}: {sigma:.3g} m")) for topic, sigma in scatter.items()
-    ]
+    for who, words in map(in_words, summary.get("accuracy") or []):
+        rows.append(("accuracy, where none is stated", text(f"{who}: {words}")))
     unused = summary.get("unused") or {}
     rows += [("may hold detections, not used", text(f"{channel}: {why}")) for channel, why in unused.items()]
     # Other parts of the page tell of these already.
-    known = {*LEFT_OUT, "lost_spans_ns", "is_complete", "frame", "suspicions", "unused", "scatter_sigma_m", *EXTRACTED}
+    known = {*LEFT_OUT, "lost_spans_ns", "is_complete", "frame", "suspicions", "unused", "accuracy", *EXTRACTED}
     flat = dict(flatten(summary))
     found = [(text(words), text(flat[key])) for key, words in EXTRACTED.items() if flat.get(key)]
     # What else was counted is told where there was any.

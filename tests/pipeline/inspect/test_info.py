@@ -1,8 +1,10 @@
 import dataclasses
 import tomllib
 
+import numpy as np
 import pytest
 from fixtures.recorder import recording
+from fixtures.small_logs import detection, write_log
 
 from cadence.errors import InputError
 from pipeline.inspect.info import describe_log, render
@@ -70,3 +72,12 @@ def test_folder_of_a_split_recording_is_one_log(tmp_path):
     (tmp_path / "metadata.yaml").write_text("relative_file_paths:\n  - bag_0.mcap\n  - bag_1.mcap\n")
     described = describe_log(tmp_path)
     assert [channel.num_messages for channel in described.channels] == [80, 80, 80]
+
+
+def test_accuracy_that_is_not_stated(tmp_path):
+    noisy = np.random.default_rng(3).normal(0.0, 4.0, (200, 2)) + [[6.0 * i, 0.0] for i in range(200)]
+    log = [detection(float(i), *place, agent_id="a") for i, place in enumerate(noisy.tolist())]
+    text = render(describe_log(write_log(tmp_path / "log.mcap", log)))
+    assert (
+        "Accuracy of the detections, where messages do not state it:\n  /detections: no accuracy is stated; a standard" in text
+    )

@@ -1,4 +1,4 @@
-"""The accuracy of detections that state none, by their scatter; and statements that the scatter contradicts."""
+"""The accuracy of detections that state none, by their likelihood; and statements that it contradicts."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -8,14 +8,15 @@ import pytest
 from fixtures.small_logs import Row, detection, fix
 from test_extract import run
 
-from pipeline.extract.scatter import scatter_of
+from pipeline.accuracies import lines
+from pipeline.extract.one_target import is_one_target
 
-SECONDS = np.arange(120.0)
+SECONDS = np.arange(240.0)
 STRAIGHT = np.column_stack([5.0 * SECONDS, 0.0 * SECONDS])
 CIRCLE = 200.0 * np.column_stack([np.cos(SECONDS / 20.0), np.sin(SECONDS / 20.0)])
 
 
-def noise(sigma_m: float, num: int = 120, seed: int = 3) -> np.ndarray:
+def noise(sigma_m: float, num: int = 240, seed: int = 3) -> np.ndarray:
     return np.random.default_rng(seed).normal(0.0, sigma_m, (num, 2))
 
 
@@ -23,62 +24,34 @@ def several(num_targets: int, apart_m: float, sigma_m: float) -> np.ndarray:
     """Each second one of several targets that go side by side, at random."""
     who = np.random.default_rng(8).integers(0, num_targets, 120)
     places = apart_m * np.array([[0, 0], [0, 1], [1, 0], [1, 1], [2, 0]])
-    return STRAIGHT + places[who] + noise(sigma_m)
+    return STRAIGHT[:120] + places[who] + noise(sigma_m, 120)
 
 
 @pytest.mark.parametrize("way", [STRAIGHT, CIRCLE, 0.0 * STRAIGHT])
 @pytest.mark.parametrize("sigma_m", [2.0, 10.0])
-@pytest.mark.parametrize("is_one", [True, False])
-def test_white_noise(way: np.ndarray, sigma_m: float, is_one: bool) -> None:
-    found = scatter_of(SECONDS, way + noise(sigma_m), is_one)
-    assert found is not None and found.is_noise and found.sigma_m == pytest.approx(sigma_m, rel=0.2)
-
-
-def test_white_noise_at_irregular_times() -> None:
-    time_s = np.sort(np.random.default_rng(5).uniform(0.0, 120.0, 120))
-    found = scatter_of(time_s, np.column_stack([5.0 * time_s, 0.0 * time_s]) + noise(3.0), True)
-    assert found is not None and found.is_noise and found.sigma_m == pytest.approx(3.0, rel=0.25)
-
-
-@pytest.mark.parametrize(
-    "position_m",
-    [
-        STRAIGHT,
-        CIRCLE,
-        np.cumsum(noise(3.0), axis=0),  # a random walk
-        np.round(CIRCLE),  # rounded to a metre
-        np.column_stack([5.0 * SECONDS, 20.0 * np.sin(SECONDS / 2.0)]),  # turns sharply
-        np.tile([3.0, 4.0], (120, 1)),
-    ],
-)
-def test_ways_without_noise(position_m: np.ndarray) -> None:
-    found = scatter_of(SECONDS, position_m, True)
-    assert found is not None and not found.is_noise
-
-
-def test_turns_that_are_seen_too_rarely() -> None:
-    """An aircraft on circles of two minutes, reported every three on average: kilometres of scatter, and no noise."""
-    time_s = np.cumsum(np.random.default_rng(2).uniform(60.0, 300.0, 120))
-    circles = 1500.0 * np.column_stack([np.cos(time_s / 19.0), np.sin(time_s / 19.0)])
-    found = scatter_of(time_s, circles, True)
-    assert found is None or not found.is_noise
+def test_one_target_with_noise(way: np.ndarray, sigma_m: float) -> None:
+    assert is_one_target(SECONDS, way + noise(sigma_m))
 
 
 @pytest.mark.parametrize(
     ("num", "apart_m", "sigma_m"), [(2, 10.0, 2.0), (2, 50.0, 0.0), (2, 100.0, 2.0), (4, 30.0, 2.0), (5, 100.0, 2.0)]
 )
 def test_several_targets_are_not_one_noisy_one(num: int, apart_m: float, sigma_m: float) -> None:
-    assert scatter_of(SECONDS, several(num, apart_m, sigma_m), False) is None
+    assert not is_one_target(SECONDS[:120], several(num, apart_m, sigma_m))
 
 
 def test_two_targets_in_turn() -> None:
-    position_m = STRAIGHT + np.column_stack([0.0 * SECONDS, 30.0 * (SECONDS % 2)])
-    assert scatter_of(SECONDS, position_m, False) is None
+    assert not is_one_target(SECONDS, STRAIGHT + np.column_stack([0.0 * SECONDS, 30.0 * (SECONDS % 2)]))
 
 
 @pytest.mark.parametrize("num", [0, 1, 5, 27])
 def test_too_few_rows(num: int) -> None:
-    assert scatter_of(SECONDS[:num], (STRAIGHT + noise(2.0))[:num], True) is None
+    assert not is_one_target(SECONDS[:num], (STRAIGHT + noise(2.0))[:num])
+
+
+def accuracies(summary: dict) -> dict[str, float]:
+    """What is taken, by source."""
+    return {record["sources"][0]: record["sigma_m"] for record in summary["accuracy"] if record["is_taken"]}
 
 
 def rows(position_m: np.ndarray, agent: str | None = "a", covariance_m2: float | None = None) -> list[Row]:
@@ -91,16 +64,19 @@ def rows(position_m: np.ndarray, agent: str | None = "a", covariance_m2: float |
 @pytest.mark.parametrize("stated", [None, 0.0, -1.0, float("nan"), 1e308])
 def test_unknown_accuracy_is_that_of_the_scatter(tmp_path: Path, agent: str | None, stated: float | None) -> None:
     found = run(tmp_path, rows(STRAIGHT + noise(2.0), agent, stated))
-    assert (
-        found.summary["scatter_sigma_m"] == {"/detections": pytest.approx(2.0, rel=0.2)} and found.summary["suspicions"] == []
-    )
-    sigma_m = found.summary["scatter_sigma_m"]["/detections"]
-    assert found.detections["cov_xx_m2"].to_pylist() == pytest.approx([sigma_m**2] * 120)
+    sigmas_m = accuracies(found.summary)
+    assert sigmas_m == {"/detections": pytest.approx(2.0, rel=0.2)} and found.summary["suspicions"] == []
+    low_m, high_m = found.summary["accuracy"][0]["sigma_interval_m"]
+    assert low_m < 2.0 < high_m
+    assert found.detections["cov_xx_m2"].to_pylist() == pytest.approx([sigmas_m["/detections"] ** 2] * 240)
+    assert lines(found.summary["accuracy"])[0].startswith("/detections: no accuracy is stated; a standard deviation of ")
 
 
-def test_without_scatter_they_stay_exact(tmp_path: Path) -> None:
-    found = run(tmp_path, rows(CIRCLE))
-    assert found.summary["scatter_sigma_m"] == {} and found.detections["cov_xx_m2"].null_count == 120
+@pytest.mark.parametrize(("num", "words"), [(240, "no noise of the detections can be told"), (10, "too few detections")])
+def test_where_nothing_shows_noise_they_stay_exact(tmp_path: Path, num: int, words: str) -> None:
+    found = run(tmp_path, rows(CIRCLE)[:num])
+    assert accuracies(found.summary) == {} and found.detections["cov_xx_m2"].null_count == num
+    assert words in lines(found.summary["accuracy"])[0]
 
 
 @pytest.mark.parametrize(
@@ -112,7 +88,7 @@ def test_without_scatter_they_stay_exact(tmp_path: Path) -> None:
 )
 def test_what_the_user_states_counts(tmp_path: Path, told: dict[str, object]) -> None:
     found = run(tmp_path, rows(STRAIGHT + noise(2.0)), **told)
-    assert set(found.detections["cov_xx_m2"].to_pylist()) == {49.0} and found.summary["scatter_sigma_m"] == {}
+    assert set(found.detections["cov_xx_m2"].to_pylist()) == {49.0} and found.summary["accuracy"] == []
 
 
 @pytest.mark.parametrize(
@@ -145,8 +121,8 @@ def test_a_covariance_that_its_type_disowns(tmp_path: Path) -> None:
         for i, (x, y) in enumerate(metres.tolist())
     ]
     found = run(tmp_path, log)
-    assert found.summary["disowned_covariance"] == 120
-    assert found.summary["scatter_sigma_m"]["/contacts/A"] == pytest.approx(10.0, rel=0.2)
+    assert found.summary["disowned_covariance"] == 240
+    assert accuracies(found.summary)["/contacts/A"] == pytest.approx(10.0, rel=0.2)
     told = run(tmp_path, log, detections=[{"topic": "/contacts/{agent}", "covariance": "position_covariance"}])
     assert set(told.detections["cov_xx_m2"].to_pylist()) == {100.0} and told.summary["disowned_covariance"] == 0
 
@@ -158,7 +134,7 @@ def test_one_agents_numbers_do_not_touch_anothers(tmp_path: Path) -> None:
         for name, value in (("a", 1e308), ("b", -1.0), ("c", float("nan")), ("d", 4.0))
     ]
     found = run(tmp_path, log)
-    assert set(found.summary["scatter_sigma_m"]) == {"/contacts/a", "/contacts/b", "/contacts/c"}
+    assert set(accuracies(found.summary)) == {"/contacts/a", "/contacts/b", "/contacts/c"}
     sound = [row for row in log if row.topic == "/contacts/d"]
     alone = run(tmp_path, sound).detections.drop(["sequence"])
     of_all = found.detections.drop(["sequence"]).filter([name == "d" for name in found.detections["agent_id"].to_pylist()])

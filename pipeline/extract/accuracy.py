@@ -1,0 +1,129 @@
+"""How accurate detections are that do not say so, by their own likelihood; and statements that cannot be meant.
+
+Each source, a topic or a sensor of it, has its own noise (`cadence.measurement`). Sources that say too little alone are taken
+together with others of their message type. Rows without a name tell of it where they may be one target's.
+"""
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from cadence.arrays import Float64s, Int64s
+from cadence.measurement.noise import MeasurementNoise, Track, covariances_m2, measurement_noise, roughness_m
+from pipeline.accuracies import Accuracy
+from pipeline.extract.one_target import is_one_target
+from pipeline.extract.positions import Positions
+from pipeline.suspicions import Suspicions
+
+_MIN_STRETCHES: Final = 12
+"""Of a source that is not taken together with others."""
+_MAX_ROWS: Final = 4096
+"""More rows of a track would not tell more."""
+_MIN_VAGUE_M: Final = 100.0
+_VAGUE_RATIO: Final = 1000.0
+"""Smoothed positions scatter less than they are off, by a hundred times at most; by a thousand where a driver writes 1e6 m²."""
+_SURE_RATIO: Final = 10.0
+
+
+@dataclass(frozen=True, eq=False)
+class _Source:
+    """The rows of a source, and its targets' tracks, each with its rows."""
+
+    name: str
+    kind: str
+    rows: Int64s
+    tracks: list[tuple[Int64s, Track]]
+
+    @property
+    def ways(self) -> list[Track]:
+        """The tracks, as long as is worth looking at."""
+        return [Track(track.time_s[:_MAX_ROWS], track.position_m[:_MAX_ROWS]) for _, track in self.tracks]
+
+
+def with_accuracy(
+    rows: Positions, told_topics: Collection[str], has_default: bool, kinds: Mapping[str, str], suspicions: Suspicions
+) -> tuple[Positions, list[Accuracy]]:
+    """Detections [N], in metres, with a covariance where they state none and show noise; and what was found of each source.
+
+    `told_topics` have an accuracy of the user's, who with `has_default` has one for all others that state none. `kinds` are the
+    message types of topics. Statements that the detections contradict are not believed, and suspected.
+    """
+    covariance = rows.covariance_m2.copy()
+    sources = [source for source in _sources(rows, kinds) if rows.topic[source.rows[0]] not in told_topics]
+    if suspicions.looks_for("covariance"):
+        for source in sources:
+            stated = source.rows[~np.isnan(covariance[source.rows, 0])]
+            if _is_contradicted(source, covariance[stated], suspicions):
+                covariance[stated] = np.nan
+    found = []
+    open_sources = [s for s in sources if not has_default and np.isnan(covariance[s.rows, 0]).any()]
+    for group, noise in _noises(open_sources):
+        is_open = np.isnan(covariance[:, 0])
+        number = sum(int(is_open[source.rows].sum()) for source in group)
+        found.append(Accuracy(tuple(source.name for source in group), number, noise))
+        if noise is None or not noise.is_sure:
+            continue
+        for of_track, track in (pair for source in group for pair in source.tracks):
+            filled = covariances_m2(track, noise)[:, [0, 0, 1], [0, 1, 1]]
+            covariance[of_track[is_open[of_track]]] = filled[is_open[of_track]]
+    return rows.changed(covariance_m2=covariance), found
+
+
+def _noises(sources: Sequence[_Source]) -> list[tuple[list[_Source], MeasurementNoise | None]]:
+    """Sources with their noise: each alone where it says enough, else together with those of its kind that do not."""
+    found: list[tuple[list[_Source], MeasurementNoise | None]] = []
+    weak: dict[str, list[_Source]] = {}
+    for source in sources:
+        noise = measurement_noise(source.ways)
+        if noise is not None and noise.num_stretches >= _MIN_STRETCHES:
+            found.append(([source], noise))
+        else:
+            weak.setdefault(source.kind, []).append(source)
+    return found + [(group, measurement_noise([way for source in group for way in source.ways])) for group in weak.values()]
+
+
+def _is_contradicted(source: _Source, covariance_m2: Float64s, suspicions: Suspicions) -> bool:
+    """Whether detections are far from as accurate as they state."""
+    if not len(covariance_m2) or not source.tracks:
+        return False
+    stated_m, most_m = float(np.sqrt(np.median(covariance_m2[:, [0, 2]].mean(axis=1)))), roughness_m(source.ways)
+    is_vague = stated_m >= _MIN_VAGUE_M and stated_m > _VAGUE_RATIO * most_m
+    noise = None
+    if is_vague or most_m > _SURE_RATIO * stated_m:
+        noise = measurement_noise(source.ways)
+    is_sure = noise is not None and noise.sigma_interval_m[0] > _SURE_RATIO * stated_m
+    if noise is None or not (is_vague or is_sure):
+        return False
+    done = f"{noise.sigma_m:.3g} m are taken" if noise.is_sure else "taken as not stated"
+    seen = f"a standard deviation of {stated_m:.3g} m is stated, but the detections scatter by {noise.sigma_m:.3g} m"
+    suspicions.add("covariance", source.name, seen=seen, done=done, setting='extract.trusted = ["covariance"]')
+    return True
+
+
+def _sources(rows: Positions, kinds: Mapping[str, str]) -> list[_Source]:
+    topics, sensors, agents = rows.topics.number, rows.sensors.number, rows.agents.number
+    keys = np.column_stack([topics, sensors])
+    found = []
+    for key in np.unique(keys, axis=0):
+        of_source = np.flatnonzero((keys == key).all(1))
+        topic, sensor = str(rows.topic[of_source[0]]), rows.sensor[of_source[0]]
+        is_only = len(np.unique(sensors[topics == key[0]])) == 1
+        name = topic if sensor is None or is_only else f"{topic} sensor {sensor}"
+        order = of_source[np.argsort(agents[of_source], kind="stable")]
+        parts = np.split(order, np.flatnonzero(np.diff(agents[order])) + 1)
+        tracks = [track for part in parts for track in _track(rows, part, bool(agents[part[0]] >= 0))]
+        found.append(_Source(name, kinds.get(topic, topic), of_source, tracks))
+    return found
+
+
+def _track(rows: Positions, part: Int64s, is_named: bool) -> list[tuple[Int64s, Track]]:
+    """Rows by time, and the track that they make; none where they have no name and may be several targets'."""
+    part = part[np.argsort(rows.time_ns[part], kind="stable")]
+    track = Track((rows.time_ns[part] - rows.time_ns[part[0]]) * 1e-9, np.column_stack([rows.first[part], rows.second[part]]))
+    if is_named:
+        return [(part, track)]
+    is_new = np.diff(track.time_s, prepend=-np.inf) > 0
+    is_each = len(np.unique(rows.message[part])) == len(part)
+    return [(part, track)] if is_each and is_one_target(track.time_s[is_new], track.position_m[is_new]) else []
