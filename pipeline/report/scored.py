@@ -77,7 +77,7 @@ def score_mission(directory: Path, mission: Mission) -> Scored | str:
     motion = truth.fresh()
 
     def draw(chosen: Tensor) -> HypothesisSet:
-        return case.draw(index[chosen])
+        return case.draw_scored(index[chosen])
 
     cells = score_in_chunks(
         motion.watch(draw), scored, truth_m, is_known, case.num_hypotheses, fastest_m=truth.fastest_m, is_brief=True

@@ -18,7 +18,7 @@ from pipeline.grids import Grid
 from pipeline.manifest import read_manifest
 from pipeline.obstacle_file import OBSTACLES_NAME, read_obstacles
 from pipeline.results import MissionHypotheses
-from pipeline.scoring.matching import match_to_truth, matched_windows
+from pipeline.scoring.matching import match_to_truth, matched, matched_windows
 from pipeline.scoring.scores import IsInside
 from pipeline.tables import read_table
 from pipeline.tracks import UNKNOWN_AGENT
@@ -75,6 +75,11 @@ class Case:
     def draw(self, index: Tensor) -> HypothesisSet:
         """The stored hypotheses of the windows with the indices [b]."""
         return _stored_hypotheses(self.stored, self.windows, index, self.num_hypotheses)
+
+    def draw_scored(self, index: Tensor) -> HypothesisSet:
+        """The same by the agents of the truth."""
+        found = self.draw(index)
+        return matched(found, self.match[index]) if self.is_matched else found
 
 
 def read_case(

@@ -116,7 +116,7 @@ def test_agents_without_names_are_compared_with_the_truth_that_they_stand_for(
     directory = nameless(tmp_path, monkeypatch)
     rows = [
         {"log_id": "walk", "time_ns": START_NS + time * 10**9, "agent_id": name, "x_m": 5.0 * time, "y_m": north}
-        for name, north in (("ship", 0.0), ("tug", 800.0))
+        for name, north in (("tug", 0.0), ("ship", 800.0), ("boat", 5000.0))  # in another order than agents; one is never seen
         for time in range(0, 90, 2)
     ]
     write_table(pa.Table.from_pylist(rows, schema=TRUTH), directory / "truth.parquet", "truth", Frame("map"))
