@@ -37,7 +37,7 @@ demo: $(STAMP)  ## Simulate a mission, run the whole pipeline on it, say where t
 	@echo "  $(BIN)/cadence run YOUR_LOG.mcap --out out/mine"
 
 test: lint  ## Lint, types, all tests, and no package less tested than before: what continuous integration runs.
-	$(BIN)/python -m pytest --cov --cov-report=json:$(COVERAGE)
+	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile --cov --cov-report=json:$(COVERAGE)
 	$(BIN)/python tests/coverage_floors.py $(COVERAGE)
 
 lint: $(STAMP)  ## Lint, format check, types.
