@@ -1,12 +1,14 @@
 """Constraints on hypotheses: guidance of clean estimates while sampling, repair and weights at the end."""
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 from typing import Literal, Self
 
 import torch
 from torch import Tensor
 
 from cadence.constraints import Constraint
+from cadence.constraints.agility import Agility, calmed
 from cadence.constraints.limits import KeepOut, within_limits
 from cadence.constraints.motion import SpeedConstraint
 from cadence.constraints.obstacles import ObstacleConstraint, Obstacles
@@ -19,6 +21,12 @@ _PINNED_SHARE = 0.05
 _HELD_SHARE = 0.5
 """Steps that the bank knows to within so many step lengths stay where they are when a track is slowed down."""
 
+_MOST_SIGMAS = 3.0
+"""A track that was smoothed still passes a detection within so many of them."""
+
+_CALMING_ROUNDS = 3
+"""A way round an obstacle has corners, and a corner that is smoothed may touch the obstacle: in turns."""
+
 _LEAST_WEIGHT = 1e-3
 
 
@@ -30,15 +38,22 @@ class GuidanceConfig:
                    of the place preset only "none" counts (infer.place says how it guides), and the paper preset has infer.paper
     margin_m       distance to keep from obstacles
     max_speed_mps  a speed that the target cannot exceed; None = no limit
+    max_acceleration_mps2  an acceleration, in any direction, that it cannot exceed; of the general preset
+    max_turn_rate_dps  a rate of turn in degrees a second that it cannot exceed while it moves, which means faster than a
+                   twentieth of what is typical of the log; of the general preset
     """
 
     mode: Literal["clean", "repair", "none"] = "clean"
     margin_m: float = 0.0
     max_speed_mps: float | None = None
+    max_acceleration_mps2: float | None = None
+    max_turn_rate_dps: float | None = None
 
     def __post_init__(self) -> None:
-        if self.margin_m < 0 or (self.max_speed_mps is not None and not self.max_speed_mps > 0):
-            raise ValueError("margin_m must not be negative, max_speed_mps must be positive")
+        limits = {name: getattr(self, name) for name in ("max_speed_mps", "max_acceleration_mps2", "max_turn_rate_dps")}
+        wrong = [name for name, value in limits.items() if value is not None and not value > 0]
+        if self.margin_m < 0 or wrong:
+            raise ValueError(f"{wrong[0]} must be positive" if wrong else "margin_m must not be negative")
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,6 +64,7 @@ class Feasibility:
     step_s         of the grid
     max_speed_mps  that is stated, None for no limit
     plausible_speed_mps  what the log's own detections let one believe; tracks keep it, but are not guided by it
+    max_acceleration_mps2, max_turn_rate_dps  that are stated, None for no limit; tracks are smoothed until they keep them
     num_steps      of guidance on each clean estimate
     """
 
@@ -56,6 +72,8 @@ class Feasibility:
     step_s: float
     max_speed_mps: float | None = None
     plausible_speed_mps: float | None = None
+    max_acceleration_mps2: float | None = None
+    max_turn_rate_dps: float | None = None
     num_steps: int = 3
 
     @classmethod
@@ -68,7 +86,8 @@ class Feasibility:
             return cls(KeepOut(Obstacles.none(), 0.0, offset_m), windows.step_s)
         obstacles = Obstacles.none() if context is None else context.obstacles
         keep_out = KeepOut(obstacles, config.margin_m, offset_m)
-        return cls(keep_out, windows.step_s, config.max_speed_mps, plausible_speed_mps)
+        agility = config.max_acceleration_mps2, config.max_turn_rate_dps
+        return cls(keep_out, windows.step_s, config.max_speed_mps, plausible_speed_mps, *agility)
 
     @property
     def is_stated(self) -> bool:
@@ -101,10 +120,11 @@ class Feasibility:
             less — and which of them are to be kept [R, K]: those within all limits, or where there are none in a row, those
             that are only faster than is plausible; none at all where every one breaks what was stated.
         """
-        if not self.keep_out.obstacles.count and self.longest_m is None:
+        agility = self._agility(length_m)
+        if not self.keep_out.obstacles.count and self.longest_m is None and not agility.is_limited:
             even = torch.full(position_m.shape[:2], 1.0 / position_m.shape[1], dtype=torch.float64)
             return position_m, even, torch.ones_like(even, dtype=torch.bool)
-        moved, is_feasible = self._within_limits(position_m, sigma_m, length_m)
+        moved, is_feasible = self._within_limits(position_m, sigma_m, length_m, agility)
         if self.plausible_speed_mps is not None:
             is_plausible = is_feasible & ~exceeds(moved, self.plausible_speed_mps * self.step_s)
             is_feasible = torch.where(is_plausible.any(1, keepdim=True), is_plausible, is_feasible)
@@ -115,13 +135,27 @@ class Feasibility:
         )
         return moved, weight / weight.sum(1, keepdim=True), is_feasible
 
-    def _within_limits(self, position_m: Tensor, sigma_m: Tensor, length_m: float) -> tuple[Tensor, Tensor]:
+    def _agility(self, length_m: float) -> Agility:
+        bend_m = None if self.max_acceleration_mps2 is None else self.max_acceleration_mps2 * self.step_s**2
+        turn_rad = None if self.max_turn_rate_dps is None else math.radians(self.max_turn_rate_dps) * self.step_s
+        return Agility(bend_m, turn_rad, _PINNED_SHARE * length_m, self.longest_m)
+
+    def _within_limits(self, position_m: Tensor, sigma_m: Tensor, length_m: float, agility: Agility) -> tuple[Tensor, Tensor]:
         is_pinned = (sigma_m <= _PINNED_SHARE * length_m)[:, None].expand(position_m.shape[:3])
         is_held = (sigma_m <= _HELD_SHARE * length_m) | (sigma_m == sigma_m.amin(dim=1, keepdim=True))
         held = is_held[:, None].expand(position_m.shape[:3])
         moved, is_feasible = within_limits(position_m, self.keep_out, is_pinned, self.longest_m, held)
+        for _ in range(_CALMING_ROUNDS if agility.is_limited else 0):
+            moved = calmed(moved, sigma_m, agility)
+            moved, is_feasible = within_limits(moved, self.keep_out, is_pinned, self.longest_m, held)
+            if not bool((agility.exceeds(moved) | ~is_feasible).any()):
+                break
         if self.max_speed_mps is not None:
             is_feasible = is_feasible & ~exceeds(moved, self.max_speed_mps * self.step_s)
+        if agility.is_limited:
+            is_near = (moved - position_m).norm(dim=-1) <= _MOST_SIGMAS * sigma_m[:, None] + _PINNED_SHARE * length_m
+            is_calm = ~replace(agility, longest_m=None).exceeds(moved)  # what is only faster than plausible may be kept
+            is_feasible = is_feasible & is_calm & (is_near | ~held).all(-1)
         return moved, is_feasible
 
 

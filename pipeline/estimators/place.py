@@ -41,6 +41,9 @@ def _limited(model: PlaceModel, guidance: GuidanceConfig) -> PlaceModel:
         raise ConfigError(
             "infer.guidance.mode: 'repair' is not for the place preset; infer.place.guidance = \"none\" only repairs there"
         )
+    for name in ("max_acceleration_mps2", "max_turn_rate_dps"):
+        if getattr(guidance, name) is not None:
+            raise ConfigError(f"infer.guidance.{name}: is for the general preset; a place model has learned how targets turn")
     longest_m = model.config.max_step_m
     if guidance.max_speed_mps is not None:
         longest_m = min(longest_m, guidance.max_speed_mps * model.config.step_s)

@@ -16,7 +16,7 @@ from schemas.tables import WINDOWS, hypotheses_schema
 ADVICE = {
     "ok": None,
     "no_detections": "not detected within this window's history; infer.grid.history_steps or step_s would widen it",
-    "infeasible": "no way between detections keeps all limits; check obstacles, infer.guidance.margin_m and max_speed_mps",
+    "infeasible": "no way between detections keeps all limits; check obstacles and infer.guidance (margin_m, max_...)",
     "guidance_diverged": "sampling did not stay finite, so the bank's samples stand in; report this log",
 }
 """What to do about each status of a window."""

@@ -1,12 +1,14 @@
 """Constraints on hypotheses: guided while drawn, repaired at the end, weighed; and drawing again by weight."""
 
 import dataclasses
+import math
 
 import pytest
 import torch
 from test_general import network
 
 from cadence.bank.bank import Bank
+from cadence.constraints.agility import Agility
 from cadence.constraints.checker import segments_in_collision, states_in_collision
 from cadence.constraints.limits import KeepOut
 from cadence.constraints.obstacles import Obstacles
@@ -112,6 +114,20 @@ def test_a_speed_limit_slows_down() -> None:
     far = POSTERIOR.sample_m + 3.0 * torch.randn(POSTERIOR.sample_m.shape, generator=torch.Generator().manual_seed(0))
     before, after = (torch.diff(p, dim=2).norm(dim=-1).max() for p in (far, fast.guide(far, sigma, slice(0, 2))))
     assert after < 0.8 * before
+
+
+@pytest.mark.parametrize(("obstacles", "bend", "turn_deg"), [(Obstacles.none(), 0.6, 40.0), (OBSTACLES, 1.5, 80.0)])
+def test_stated_acceleration_and_turns_hold_in_every_hypothesis(obstacles: Obstacles, bend: float, turn_deg: float) -> None:
+    """With speed and obstacles: what keeps them not is drawn again. Round an obstacle as small as a step not all rows can."""
+    stated = GuidanceConfig("clean", 0.0, 6.0 * LENGTH_M, bend * LENGTH_M, turn_deg)
+    found = dataclasses.replace(MODEL, guidance=stated).sample(WINDOWS.with_context(Context(DATUM, obstacles=obstacles)), NUM)
+    is_ok = torch.tensor([row[0] == "ok" for row in found.status])
+    assert bool(is_ok.any()) and (obstacles.count or bool(is_ok.all()))
+    track = found.position_m[is_ok][:, :, 0]
+    agility = Agility(bend * LENGTH_M, math.radians(turn_deg), 0.05 * LENGTH_M, 6.0 * LENGTH_M)
+    assert not bool(agility.exceeds(track).any())
+    assert not bool(states_in_collision(track, obstacles, offset_m=DATUM[is_ok][:, None, None]).any())
+    assert bool(agility.exceeds(MODEL.sample(WINDOWS, NUM).position_m[:, :, 0]).any())
 
 
 def test_margin_is_kept() -> None:
