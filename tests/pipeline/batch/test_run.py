@@ -44,7 +44,9 @@ def calls(monkeypatch):
     )
     for stage in STAGES[1:]:
         monkeypatch.setattr(
-            module, stage, lambda directory, config, progress, force, stage=stage: fake(stage, directory.name, config, force)
+            module,
+            stage,
+            lambda directory, config, progress, force, *_, stage=stage: fake(stage, directory.name, config, force),
         )
     return record
 
