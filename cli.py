@@ -262,7 +262,10 @@ def report(
     from pipeline.report.stage import ReportConfig
     from pipeline.report.stage import report as stage
 
-    _show(stage(mission, stage_config(ReportConfig, "report", config, settings or ()), Progress(quiet), force), as_json)
+    _show(
+        stage(mission, stage_config(ReportConfig, "report", config, settings or ()), Progress(quiet), force),
+        as_json,
+    )
 
 
 @app.command()
@@ -335,7 +338,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         _complain(error)
         return error.exit_code
     except typer.TyperException as error:
-        _complain(UsageError(f"{error.format_message()} (see cadence --help)"))
+        context = getattr(error, "ctx", None)
+        said = error.format_message().replace("Value error, ", "").rstrip(".")
+        _complain(UsageError(f"{said}; see {context.command_path if context else 'cadence'} --help"))
         return UsageError.exit_code
     except (MemoryError, RuntimeError) as error:
         if not is_out_of_memory(error):

@@ -16,7 +16,7 @@ from pipeline.documents import parse_json
 from pipeline.files import hash_file
 from pipeline.logs.parts import mission_name
 from pipeline.logs.reader import Health, MissionLog, reopen
-from pipeline.missions import CATALOGUE_NAME
+from pipeline.missions import CATALOGUE_NAME, no_mission
 
 CATALOGUE_VERSION: Final = 1
 
@@ -92,8 +92,8 @@ def read_catalogue(directory: Path) -> Catalogue:
     path = directory / CATALOGUE_NAME
     try:
         data = parse_json(path.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise InputError(f"{path}: not found; run `cadence ingest` first (`cadence run` does all stages)") from error
+    except (FileNotFoundError, NotADirectoryError) as error:
+        raise no_mission(directory) from error
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: cannot be read ({error}); run `cadence ingest` again with --force") from error
     version = data.get("version") if isinstance(data, dict) else None

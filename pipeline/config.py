@@ -35,6 +35,8 @@ def load_toml(path: Path) -> dict[str, Any]:
         return parse_toml(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise ConfigError(f"{path}: cannot read the configuration ({error.strerror}); check the path") from error
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{path}: not a text, so no configuration; check the path") from error
     except ValueError as error:
         raise ConfigError(f"{path}: not valid TOML: {error}; correct the file") from error
 

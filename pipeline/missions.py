@@ -41,6 +41,17 @@ class Mission:
     size_bytes: int
 
 
+def no_mission(path: Path) -> InputError:
+    """What is said of a path that is no mission directory, with the way on."""
+    if path.is_file():
+        return InputError(f"{path}: is a file, not a mission directory; `cadence run {path} --out results` makes one of a log")
+    inside = sorted(catalogue.parent for catalogue in path.glob(f"*/{CATALOGUE_NAME}"))
+    if inside:
+        return InputError(f"{path}: holds {len(inside)} mission directories; name one, such as {inside[0]}")
+    seen = f"holds no {CATALOGUE_NAME}, so it is no mission directory" if path.is_dir() else "not found"
+    return InputError(f"{path}: {seen}; `cadence run LOG --out results` makes one, results/NAME")
+
+
 def find_missions(logs: Sequence[str], out: str) -> tuple[Mission, ...]:
     """The missions among files, folders (searched through), patterns and URLs, each once, in the order given, URLs last.
 

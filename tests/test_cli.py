@@ -244,3 +244,32 @@ def test_secrets_of_urls_are_never_told(arguments, scheme, tmp_path, monkeypatch
     told = "".join(capsys.readouterr())
     assert "hidden" not in told and "someuser" not in told and "cadence: error:" in told
     assert all("hidden" not in path.read_text() for path in tmp_path.rglob("*.json"))
+
+
+def test_what_is_no_mission_directory_is_said_with_the_way_on(tmp_path, capsys):
+    log = tmp_path / "flight.mcap"
+    log.write_bytes(b"not read")
+    (tmp_path / "results" / "flight").mkdir(parents=True)
+    (tmp_path / "results" / "flight" / "catalogue.json").write_text("{}")
+    said = {
+        log: "is a file, not a mission directory; `cadence run",
+        tmp_path / "results": f"holds 1 mission directories; name one, such as {tmp_path}/results/flight",
+        tmp_path: "holds no catalogue.json, so it is no mission directory; `cadence run LOG --out results` makes one",
+        tmp_path / "nowhere": "not found; `cadence run LOG --out results` makes one",
+    }
+    for command in ("extract", "infer", "export", "report"):
+        for path, words in said.items():
+            assert cli.main([command, str(path), "-q"]) == 3
+            (line,) = capsys.readouterr().err.splitlines()
+            assert f"{path}: {words}" in line
+
+
+def test_a_wrong_call_names_the_help_of_its_command(capsys):
+    for arguments, words in (
+        (["run", "a.mcap"], "Missing option '--out'; see cadence run --help"),
+        (["run", "a.mcap", "--out", "r", "--engine", "x"], "'x' is not one of 'local', 'ray'; see cadence run --help"),
+        (["rum"], "Did you mean 'run'?; see cadence --help"),
+    ):
+        assert cli.main(arguments) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert line.endswith(words) and "Value error" not in line

@@ -171,8 +171,9 @@ class _Shown:
         self._num_finished += 1
         if outcome.trace:
             self._progress.warn(outcome.trace)
-        counted = f"[{self._num_finished}/{self._num_tasks}]"
-        self._progress.note(f"{counted} {outcome.task.name}: {outcome.status} ({outcome.elapsed_s:.1f} s)")
+        if self._num_tasks > 1:  # of one the table says it at once
+            counted = f"[{self._num_finished}/{self._num_tasks}]"
+            self._progress.note(f"{counted} {outcome.task.name}: {outcome.status} ({outcome.elapsed_s:.1f} s)")
 
     def close(self) -> None:
         """Take the bar away."""

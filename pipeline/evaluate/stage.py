@@ -116,7 +116,9 @@ def evaluate_folder(folder: Path, config: EvaluateConfig, progress: Progress) ->
     """
     directories = sorted(path.parent for path in folder.glob("*/hypotheses.parquet"))
     if not directories:
-        raise InputError(f"{folder}: holds no mission directory with hypotheses.parquet; run cadence run --out {folder} first")
+        raise InputError(
+            f"{folder}: holds no mission directory with hypotheses.parquet; `cadence run LOG --out results` makes one"
+        )
     scored, failures = [], []
     with progress.bar(len(directories), "evaluate", "log") as bar:
         for directory in directories:

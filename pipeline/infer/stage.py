@@ -22,7 +22,7 @@ from pipeline.infer.config import InferConfig
 from pipeline.infer.draws import Drawn, Piece, draw_associations, draw_tracks, draw_windows
 from pipeline.infer.rows import hypothesis_rows, window_rows, with_association
 from pipeline.manifest import StageResult, run_stage
-from pipeline.missions import CATALOGUE_NAME
+from pipeline.missions import CATALOGUE_NAME, no_mission
 from pipeline.obstacle_file import OBSTACLES_NAME, read_obstacles
 from pipeline.progress import Progress
 from pipeline.suspicions import Suspicions
@@ -49,6 +49,8 @@ def infer(
         read_info(weights)  # names what is wrong with it more plainly than an input that is missing
         inputs += [weights, weights.with_suffix(".json")]
     refuse_unread(config.checkpoint, config)
+    if not inputs[0].is_file() and not (directory / CATALOGUE_NAME).is_file():
+        raise no_mission(directory)
     detections, frame = read_table(inputs[0], "detections")
     start_ns = _mission_start_ns(directory, detections)
 

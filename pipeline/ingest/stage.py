@@ -76,7 +76,7 @@ def _files(log: Path | Sequence[Path]) -> tuple[Path, ...]:
     given = [log] if isinstance(log, Path) else log
     paths = tuple(part.resolve() for path in given for part in recorded_parts(path) or (path,))
     for path in paths:
-        if path.is_dir():
+        if not path.is_file():
             open_log(path)  # says what is wrong; the stage would try to hash it
     if len({path.name for path in paths}) < len(paths):  # manifests know inputs by their names
         raise InputError(f"{paths[0].parent}: two parts of one mission have the same name; rename one of them")

@@ -100,10 +100,10 @@ def diagnose(parts: Sequence[Path], progress: Progress) -> Diagnosis:
         with progress.bar(size, f"check {parts[0].name}", unit="B", scale=True) as bar:
             log = open_parts(parts, bar.update)
         if not log.health.num_messages and not log.health.is_complete:
-            return _unusable(name, log.health.problems)
+            return Diagnosis(name, "unusable", problems=log.health.problems, advice=(_ADVICE["copy"],))
         return _of(name, log)
-    except InputError as error:
-        return _unusable(name, (str(error),))
+    except InputError as error:  # which says itself what to do
+        return Diagnosis(name, "unusable", problems=(str(error),))
 
 
 def exit_code(diagnoses: Sequence[Diagnosis]) -> int:
@@ -138,10 +138,6 @@ def render(diagnosis: Diagnosis) -> str:
     if diagnosis.advice:
         lines += ["What to do:", *(f"  {sentence}" for sentence in diagnosis.advice)]
     return "\n".join(lines)
-
-
-def _unusable(name: str, problems: tuple[str, ...]) -> Diagnosis:
-    return Diagnosis(name, "unusable", problems=problems, advice=(_ADVICE["copy"],))
 
 
 def _of(name: str, log: MissionLog) -> Diagnosis:

@@ -18,6 +18,7 @@ _KINDS = {
     b"\x89MCAP": "an MCAP of another version, or one whose line ends a copy has changed; copy it in binary mode",
 }
 _TABLE = re.compile(rb"[\x20-\x7e\x80-\xff]*[,;\t][\x20-\x7e\x80-\xff,;\t]*\r?\n")
+_UNKNOWN = "something else; if it was one, copy it again from where it was recorded"
 
 
 def kind_of(path: Path, head: bytes) -> str:
@@ -25,7 +26,11 @@ def kind_of(path: Path, head: bytes) -> str:
     words = next((text for magic, text in _KINDS.items() if head.startswith(magic)), None)
     if words is None:
         is_table = _TABLE.match(head) is not None
-        words = "a table as text; docs/formats.md shows how to write it as a log" if is_table else "something else"
+        words = (
+            "a table as text; docs/formats.md shows how to write it as a log"
+            if is_table
+            else "something else; if it was one, copy it again from where it was recorded"
+        )
     return words.format(source=path.parent if head.startswith(b"SQLite ") else path, stem=path.stem)
 
 

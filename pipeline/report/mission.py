@@ -20,7 +20,7 @@ from pipeline.catalogue import Catalogue, read_catalogue, stated_path
 from pipeline.documents import parse_json
 from pipeline.files import hash_file
 from pipeline.manifest import read_manifest
-from pipeline.missions import CATALOGUE_NAME
+from pipeline.missions import CATALOGUE_NAME, no_mission
 from pipeline.obstacle_file import OBSTACLES_NAME, as_obstacles, read_obstacle_entries
 from pipeline.presence import with_presence
 from pipeline.report.origins import Origins, origins_of, with_likeliest
@@ -194,7 +194,9 @@ class Mission:
 
 
 def mission_inputs(directory: Path) -> list[Path]:
-    """The files of `directory` that the page depends on, as far as they exist."""
+    """The files of `directory` that the page depends on, as far as they exist; `InputError` for no mission directory."""
+    if not (directory / CATALOGUE_NAME).is_file():
+        raise no_mission(directory)
     names = [CATALOGUE_NAME, "detections.parquet", "hypotheses.parquet", "windows.parquet", OBSTACLES_NAME]
     names += [
         "associations.parquet",

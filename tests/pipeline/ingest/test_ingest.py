@@ -152,7 +152,7 @@ def test_a_sound_log_without_a_message_is_no_failure_of_a_batch(tmp_path):
 
 def test_catalogue_that_is_absent_damaged_or_old_is_refused(log, tmp_path):
     out = tmp_path / "out"
-    with pytest.raises(InputError, match="cadence ingest"):
+    with pytest.raises(InputError, match=r"out: not found; `cadence run LOG --out results` makes one"):
         read_catalogue(out)
     ingested(log, out)
     whole = json.loads((out / CATALOGUE_NAME).read_text())

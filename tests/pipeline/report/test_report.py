@@ -263,7 +263,7 @@ def test_windows_without_any_hypotheses_are_skipped_on_the_map(mission: Path) ->
 @pytest.mark.parametrize(
     ("name", "content", "words"),
     [
-        ("catalogue.json", None, "not found"),
+        ("catalogue.json", None, "holds no catalogue.json"),
         ("catalogue.json", "{", "cannot be read"),
         ("catalogue.json", "[]", "has version None, expected 1"),
         ("scores.json", "{", "not readable JSON"),
