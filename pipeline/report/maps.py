@@ -47,7 +47,9 @@ def moment_map(
     lines = [(strand, *_between(strand, *steps)) for strand in strands if _between(strand, *steps)[1].size]
     # A few stray hypotheses must not shrink all others to a dot; they are cut at the border.
     low, high = np.percentile(track_m, [4, 96], axis=(0, 1))
-    view = View(np.concatenate([low[None], high[None], *(line_m for _, _, line_m in lines), detections.position_m]))
+    seen_m = detections.position_m
+    is_near = ((seen_m >= track_m.min(axis=(0, 1))) & (seen_m <= track_m.max(axis=(0, 1)))).all(axis=1)
+    view = View(np.concatenate([low[None], high[None], *(line_m for _, _, line_m in lines), seen_m[is_near]]))
     parts = [_obstacle(item, view) for item in mission.obstacles]
     if truth is not None:
         parts.append(_line(view.pixels(truth.between(first_ns, last_ns).position_m), "truth"))

@@ -133,8 +133,10 @@ def _facts(mission: Mission) -> list[tuple[str, str, str]]:
         is_unknown |= mission.detections.owner == mission.agents.index(UNKNOWN_AGENT)
     unknown = int(is_unknown.sum()) if mission.origins is None else mission.origins.num_detections
     num_seen = len({row.agent for row in mission.rows})
-    others = {"only in the truth": len(mission.agents) - num_seen, "without hypotheses": num_seen - mission.num_tracked}
-    more = ", ".join(f"{count:,} more {words}" for words, count in others.items() if count)
+    # Agents that were found have other names than those of the truth, and may be the same.
+    only_true = "more only in the truth" if mission.origins is None else "named by the truth"
+    others = {only_true: len(mission.agents) - num_seen, "more without hypotheses": num_seen - mission.num_tracked}
+    more = ", ".join(f"{count:,} {words}" for words, count in others.items() if count)
     facts = [
         ("Agents", f"{mission.num_tracked:,}", more),
         ("Detections", f"{len(mission.detections):,}", f"{unknown:,} without a known agent" if unknown else ""),

@@ -2,7 +2,7 @@
 
 import json
 import tomllib
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
@@ -18,8 +18,9 @@ from pipeline.report.clock import Clock, duration
 from pipeline.report.fans import Detail, choose_detail, choose_vertices, encode_fan
 from pipeline.report.geodesy import EXPONENTS, fit_geodesy
 from pipeline.report.lengths import metres, nice_length
+from pipeline.report.maps import moment_map
 from pipeline.report.markup import as_toml, inline_json, text
-from pipeline.report.mission import Fan, load_mission
+from pipeline.report.mission import Fan, Points, load_mission
 from pipeline.report.modes import strands_of
 from pipeline.report.shapes import shape_of, spread_at
 from pipeline.tables import Frame
@@ -227,3 +228,18 @@ def test_spread_axis_puts_decades_on_a_line() -> None:
     axis = SpreadAxis(Spreads())
     assert axis.decades() == [1.0, 10.0, 100.0]
     assert axis.pixels(np.array([100.0, 10, 1, 0])).tolist() == pytest.approx([0, 42, 84, 84])
+
+
+def test_a_detection_far_from_all_hypotheses_does_not_shrink_a_map(tmp_path) -> None:
+    mission = load_mission(build_mission(tmp_path))
+    fan = mission.fans[0]
+    strands = strands_of(fan, shape_of(fan), None)
+    steps = (0, fan.offset_m.shape[1] - 1)
+    near = moment_map(mission, fan, strands, None, steps, "")
+    far = Points(np.array([fan.origin_ns]), np.array([fan.agent]), np.array([[9e6, 9e6]]))
+    seen = mission.detections
+    more = Points(*(np.concatenate([getattr(seen, name), getattr(far, name)]) for name in ("time_ns", "owner", "position_m")))
+    order = np.argsort(more.time_ns, kind="stable")
+    more = Points(more.time_ns[order], more.owner[order], more.position_m[order])
+    odd = moment_map(replace(mission, detections=more), fan, strands, None, steps, "")
+    assert odd.partition('class="bar"')[2] == near.partition('class="bar"')[2]

@@ -136,6 +136,8 @@ def test_agents_without_names_are_compared_with_the_truth_that_they_stand_for(
         if (row["by"], row["part"], row["metric"]) == ("part", "past", "ade_m")
     )
     assert scored.mean("past", "ade_m") == pytest.approx(row["value"], rel=1e-12)
+    report(directory, ReportConfig(), QUIET)
+    assert "<small>3 named by the truth</small>" in (directory / "report.html").read_text()
 
 
 @pytest.mark.parametrize(("limit_mps", "words"), [(1e6, "0 of 132 tracks"), (0.001, "132 of 132 tracks")])
