@@ -19,7 +19,7 @@ CONNECT_TIMEOUT_S: Final = 10.0
 READ_TIMEOUT_S: Final = 60.0
 _S3: Final = ("s3", "s3a")
 _PACKAGES: Final = {"gs": "gcsfs", "gcs": "gcsfs", "abfs": "adlfs", "az": "adlfs"}
-_LIBRARIES: Final = ("aiobotocore", "aiohttp", "botocore", "fsspec", "gcsfs", "google", "s3fs")
+_LIBRARIES: Final = ("aiobotocore", "aiohttp", "botocore", "fsspec", "ftplib", "gcsfs", "google", "s3fs")
 _PERMANENT_ERRNOS: Final = (1, 22, 36, 38, 78)  # not permitted, invalid, name too long, no such function, other region
 
 
@@ -34,7 +34,8 @@ def open_store(url: str) -> tuple[Any, str]:
     try:
         import fsspec
 
-        fs, path = fsspec.core.url_to_fs(url, **_options(scheme))
+        # Some stores are asked already here, before anything is wanted of them (ftp).
+        fs, path = attempt(lambda: fsspec.core.url_to_fs(url, **_options(scheme)), url)
     except ImportError as error:
         raise ConfigError(f"{shown(url)}: {scheme}:// needs a package that is not installed; pip install {package}") from error
     except ValueError as error:

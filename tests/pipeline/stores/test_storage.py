@@ -161,6 +161,12 @@ def test_nobody_listens(s3, new_clients, monkeypatch):
         describe("s3://sea/other")
 
 
+def test_nobody_listens_where_a_store_is_asked_at_once(monkeypatch):
+    monkeypatch.setattr("pipeline.stores.stores.FIRST_PAUSE_S", 0.0)
+    with pytest.raises(DeviceError, match=r"ftp://127.0.0.1:9/a.mcap: the store does not answer.*check the connection"):
+        describe("ftp://user:secret@127.0.0.1:9/a.mcap?token=abc")
+
+
 def test_what_is_not_there_is_said_once_and_plainly(s3, tmp_path):
     with pytest.raises(MissingObject, match=r"s3://sea/none.mcap: not found; check the URL"):
         describe("s3://sea/none.mcap")
