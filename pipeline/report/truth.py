@@ -94,8 +94,9 @@ def _evaluated(scores: Mapping[str, Any]) -> str:
     for row in scores.get("rows") or []:
         if isinstance(row, dict) and row.get("by") == "part" and row.get("part") in PARTS and row.get("metric") in METRICS:
             cells = found.setdefault((str(row["part"]), str(row.get("estimator"))), {})
-            low, high = (_value(row["metric"], row.get(side)) for side in ("low", "high"))
-            cells[str(row["metric"])] = f"{_value(row['metric'], row.get('value'))} ({low} to {high})"
+            value, low, high = (_value(row["metric"], row.get(part)) for part in ("value", "low", "high"))
+            # A unit that all three share is told once.
+            cells[str(row["metric"])] = f"{value} ({low.removesuffix(' %')} to {high.removesuffix(' %')})"
     rows = [
         [label(part), text(estimator_words(estimator)), *(text(cells.get(metric, "–")) for metric in METRICS)]
         for (part, estimator), cells in sorted(found.items(), key=lambda item: PARTS.index(item[0][0]))
@@ -108,6 +109,8 @@ def _evaluated(scores: Mapping[str, Any]) -> str:
 def _value(metric: str, value: object) -> str:
     if not isinstance(value, int | float) or value != value:
         return "–"
-    if metric.startswith("coverage") or metric.endswith("_share"):
+    if metric.startswith("coverage"):
+        return f"{100 * value:.0f} %"
+    if metric.endswith("_share"):
         return f"{100 * value:.3g} %"
     return metres(value) if metric.endswith("_m") else f"{value:.3g}"

@@ -296,8 +296,9 @@ def test_scores_of_evaluate_are_shown_unless_they_are_of_other_hypotheses(missio
         "low": 11,
         "high": None,
     }
-    (mission / "scores.json").write_text(json.dumps({"rows": [row, row | {"metric": "fde_m"}]}))
-    assert "future cadence 12.3 m (11 m to –) – – – –" in Page(make(mission)).text
+    held = row | {"metric": "coverage_90", "value": 0.912, "low": 0.8, "high": 1.0}
+    (mission / "scores.json").write_text(json.dumps({"rows": [row, row | {"metric": "fde_m"}, held]}))
+    assert "future cadence 12.3 m (11 m to –) – – – 91 % (80 to 100)" in Page(make(mission)).text
     (mission / "evaluate.manifest.json").write_text(json.dumps({"inputs": {"hypotheses.parquet": "0" * 64}, "summary": {}}))
     assert "belongs to other hypotheses" in Page(make(mission)).text
 
