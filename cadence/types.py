@@ -158,7 +158,7 @@ class HypothesisSet:
 
     position_m [B, K, A, T, 2] metres relative to the window datum; NaN for agents that are not active
     weight     [B, K] non-negative, each row sums to one
-    status     [B][A] "ok", "no_detections", "infeasible" (a hypothesis could not be moved out of an obstacle), ...
+    status     [B][A] "ok", "no_detections", "infeasible" (nothing keeps the limits), "scarce" (hardly anything does), ...
     """
 
     position_m: Tensor

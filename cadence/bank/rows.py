@@ -1,6 +1,7 @@
 """Windows and tracks as rows, one agent a row, and rows back as joint hypotheses."""
 
 import math
+from collections.abc import Mapping
 
 import torch
 from torch import Tensor
@@ -38,14 +39,11 @@ def scatter_hypotheses(sample_m: Tensor, windows: WindowBatch) -> HypothesisSet:
     return HypothesisSet(position.transpose(1, 2), torch.full((b, k), 1.0 / k, dtype=sample_m.dtype), status)
 
 
-def with_status(drawn: HypothesisSet, windows: WindowBatch, is_diverged: Tensor, is_infeasible: Tensor) -> HypothesisSet:
-    """The same hypotheses; active agents, rows [R], are "guidance_diverged" or "infeasible" where that is said of them."""
-    status = [list(words) for words in drawn.status]
+def with_status(drawn: HypothesisSet, windows: WindowBatch, words: Mapping[str, Tensor]) -> HypothesisSet:
+    """The same hypotheses; of the active agents, rows [R], the first of the words is said whose mask [R] is true there."""
+    status = [list(row) for row in drawn.status]
     for row, (window, agent) in enumerate(windows.is_active.nonzero().tolist()):
-        if bool(is_diverged[row]):
-            status[window][agent] = "guidance_diverged"
-        elif bool(is_infeasible[row]):
-            status[window][agent] = "infeasible"
+        status[window][agent] = next((word for word, where in words.items() if bool(where[row])), status[window][agent])
     return HypothesisSet(drawn.position_m, drawn.weight, tuple(map(tuple, status)))
 
 

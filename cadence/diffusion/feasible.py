@@ -181,17 +181,17 @@ def redrawn(position_m: Tensor, weight: Tensor, is_kept: Tensor, seeds: Tensor, 
     return out, is_redrawn
 
 
-def resampled(position_m: Tensor, weight: Tensor, seeds: Tensor) -> Tensor:
-    """Rows [R, K, T, 2] drawn again by their weights [R, K] (systematic), so that all count the same.
+def resampled(position_m: Tensor, weight: Tensor, seeds: Tensor, num_hypotheses: int | None = None) -> Tensor:
+    """Rows [R, K, T, 2] drawn again by their weights [R, K] (systematic), so that all count the same; `num_hypotheses` of each.
 
     For several independent agents: each has weights of its own, but a joint hypothesis has only one.
     """
-    num_hypotheses = weight.shape[1]
-    out = position_m.clone()
+    num = num_hypotheses or weight.shape[1]
+    out = position_m[:, :num].clone()
     for row, seed in enumerate(seeds.tolist()):
-        if float(weight[row].max() - weight[row].min()) > 1e-9:
+        if num != weight.shape[1] or float(weight[row].max() - weight[row].min()) > 1e-9:
             generator = torch.Generator().manual_seed(seed)
             uniform = torch.rand(1, generator=generator, dtype=torch.float64).item()
-            pick = torch.from_numpy(systematic(weight[row].numpy(), num_hypotheses, uniform))
-            out[row] = position_m[row, pick[torch.randperm(num_hypotheses, generator=generator)]]
+            pick = torch.from_numpy(systematic(weight[row].numpy(), num, uniform))
+            out[row] = position_m[row, pick[torch.randperm(num, generator=generator)]]
     return out

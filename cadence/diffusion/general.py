@@ -14,7 +14,7 @@ from torch import Tensor
 
 from cadence.bank.bank import Bank, BankPosterior
 from cadence.bank.rows import active_rows, scatter_hypotheses, with_status
-from cadence.diffusion.feasible import Feasibility, GuidanceConfig, redrawn
+from cadence.diffusion.feasible import Feasibility, GuidanceConfig, redrawn, resampled
 from cadence.diffusion.sampler import even_angles, sample_ddim, sample_dpmpp_2m, sample_rotation
 from cadence.diffusion.transport import bend_of, smoothed_displacement
 from cadence.network.residual import ResidualNetwork
@@ -26,6 +26,12 @@ _SAMPLERS = {"rotation": sample_rotation, "ddim": sample_ddim, "dpmpp": sample_d
 SamplerName = Literal["rotation", "ddim", "dpmpp"]
 _MAX_BATCH = 960
 _RAMP_STEPS = 8.0
+
+_ENOUGH = 0.5
+"""Where a smaller share of the hypotheses keeps the limits more are drawn: a few, drawn again and again, would look certain."""
+_MORE = 8
+_FEW = 0.5
+"""A row in which fewer tracks, of all that were drawn, can be kept than this share of its hypotheses has too little spread."""
 
 CleanHook = Callable[[Tensor, Tensor, slice], Tensor]
 """(positions [R', K, T, 2] in metres, sigma [R', T], which R' of the active rows) -> positions: guidance of clean estimates."""
@@ -42,6 +48,24 @@ class GateScores:
     past_half: float | None
     future_network: float | None
     future_half: float | None
+
+
+@dataclass(frozen=True, eq=False)
+class _Rows:
+    """Tracks of R active agents.
+
+    position_m  [R, K, T, 2]
+    weight      [R, K] by how far they had to be moved
+    is_kept     [R, K] they keep the limits
+    is_finite   [R] sampling stayed finite
+    num_kept    [R] of all draws that these were chosen from
+    """
+
+    position_m: Tensor
+    weight: Tensor
+    is_kept: Tensor
+    is_finite: Tensor
+    num_kept: Tensor
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,23 +108,51 @@ class GeneralModel:
         """Draw hypotheses for every active agent; deterministic in the windows' seeds.
 
         The status of an agent is "guidance_diverged" where samples of the bank had to stand in, "infeasible" where no
-        hypothesis could be brought within the limits: they are as they were.
+        hypothesis could be brought within the limits: they are as they were. Where few could, more are drawn, and where
+        few of these can be kept as well, it is "scarce".
         """
+        found = self._drawn(windows, num_hypotheses)
+        is_short = found.is_kept.double().mean(1) < _ENOUGH
+        if bool(is_short.any()):
+            found = self._drawn_anew(found, windows, is_short)
+        is_scarce = (found.num_kept < _FEW * num_hypotheses) & (found.num_kept > 0)
+        # Weights belong to one agent's tracks; a joint hypothesis of several has but one.
+        seeds, are_all = active_rows(windows)[1], windows.num_agents > 1
+        kept_m, is_even = redrawn(found.position_m, found.weight, found.is_kept, seeds, are_all)
+        drawn = scatter_hypotheses(kept_m, windows)
+        if windows.num_agents == 1:
+            weight = drawn.weight.clone()
+            weight[windows.is_active[:, 0]] = torch.where(is_even[:, None], 1.0 / num_hypotheses, found.weight)
+            drawn = HypothesisSet(drawn.position_m, weight, drawn.status)
+        words = {"guidance_diverged": ~found.is_finite, "infeasible": found.num_kept == 0, "scarce": is_scarce}
+        return with_status(drawn, windows, words)
+
+    def _drawn(self, windows: WindowBatch, num_hypotheses: int) -> "_Rows":
+        """Tracks of the active agents as near to the limits as they can be brought."""
         limits = Feasibility.of(windows, self.guidance, self.plausible_speed_mps)
         posterior = self.bank.posterior(windows, num_hypotheses)
         is_guided = self.guidance.mode == "clean" and limits.is_stated
         sample_m = self.denoised(posterior, windows, limits.guide if is_guided else None)
         is_finite = torch.isfinite(sample_m).flatten(1).all(1)
         sample_m = torch.where(is_finite[:, None, None, None], sample_m, posterior.sample_m)
-        moved_m, row_weight, is_kept = limits.finish(sample_m, posterior.sigma_m, self.bank.length_m(windows.step_s))
-        # Weights belong to one agent's tracks; a joint hypothesis of several has but one.
-        kept_m, is_even = redrawn(moved_m, row_weight, is_kept, active_rows(windows)[1], are_all=windows.num_agents > 1)
-        drawn = scatter_hypotheses(kept_m, windows)
-        if windows.num_agents == 1:
-            weight = drawn.weight.clone()
-            weight[windows.is_active[:, 0]] = torch.where(is_even[:, None], 1.0 / num_hypotheses, row_weight)
-            drawn = HypothesisSet(drawn.position_m, weight, drawn.status)
-        return with_status(drawn, windows, ~is_finite, ~is_kept.any(1))
+        moved_m, weight, is_kept = limits.finish(sample_m, posterior.sigma_m, self.bank.length_m(windows.step_s))
+        return _Rows(moved_m, weight, is_kept, is_finite, is_kept.sum(1))
+
+    def _drawn_anew(self, found: "_Rows", windows: WindowBatch, is_short: Tensor) -> "_Rows":
+        """The rows that are short of tracks [R], chosen from many more draws; where none of these can be kept, as they were."""
+        window, num_hypotheses = windows.is_active.nonzero()[:, 0], found.weight.shape[1]
+        chosen = torch.tensor(sorted(set(window[is_short].tolist())))
+        more = self._drawn(windows[chosen], _MORE * num_hypotheses)
+        place = torch.isin(window, chosen).nonzero()[:, 0]  # of the rows of `more` among all
+        is_better = is_short[place] & (more.num_kept > 0)
+        rows, chance = place[is_better], torch.where(more.is_kept, more.weight, 0.0)[is_better]
+        seeds = active_rows(windows)[1][rows]
+        anew = dataclasses.replace(found, **{name: value.clone() for name, value in vars(found).items()})
+        chance = chance / chance.sum(1, keepdim=True)
+        anew.position_m[rows] = resampled(more.position_m[is_better], chance, seeds, num_hypotheses)
+        anew.weight[rows], anew.is_kept[rows] = 1.0 / num_hypotheses, True
+        anew.is_finite[rows], anew.num_kept[rows] = more.is_finite[is_better], more.num_kept[is_better]
+        return anew
 
     def denoised(self, posterior: BankPosterior, windows: WindowBatch, guide: CleanHook | None = None) -> Tensor:
         """The bank's samples as the network moves them [R, K, T, 2], clean estimates led by `guide`; no repair."""

@@ -16,7 +16,7 @@ from pipeline.windows import MissionWindows
 
 _WINDOWS_AT_ONCE = 32
 _TRACKS_AT_ONCE = 48
-_WORST_FIRST = ("guidance_diverged", "infeasible", "ok")
+_WORST_FIRST = ("guidance_diverged", "infeasible", "scarce", "ok")
 
 Drawn = tuple[Tensor, Tensor, Tensor, list[list[str]]]
 """Numbers of windows [b], positions [b, K, A, T, 2] about their datum, weights [b, K], status [b][A]."""

@@ -17,6 +17,7 @@ ADVICE = {
     "ok": None,
     "no_detections": "not detected within this window's history; infer.grid.history_steps or step_s would widen it",
     "infeasible": "no way between detections keeps all limits; check obstacles and infer.guidance (margin_m, max_...)",
+    "scarce": "hardly a draw keeps all limits, so these are narrower than what is known; check obstacles and infer.guidance",
     "guidance_diverged": "sampling did not stay finite, so the bank's samples stand in; report this log",
 }
 """What to do about each status of a window."""

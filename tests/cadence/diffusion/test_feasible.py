@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from typing import Any
 
 import pytest
 import torch
@@ -12,6 +13,8 @@ from cadence.constraints.agility import Agility
 from cadence.constraints.checker import segments_in_collision, states_in_collision
 from cadence.constraints.limits import KeepOut
 from cadence.constraints.obstacles import Obstacles
+from cadence.constraints.speed import exceeds
+from cadence.diffusion import general
 from cadence.diffusion.feasible import Feasibility, GuidanceConfig, resampled
 from cadence.diffusion.general import GeneralModel
 from cadence.types import Context, Detections, WindowBatch
@@ -128,6 +131,40 @@ def test_stated_acceleration_and_turns_hold_in_every_hypothesis(obstacles: Obsta
     assert not bool(agility.exceeds(track).any())
     assert not bool(states_in_collision(track, obstacles, offset_m=DATUM[is_ok][:, None, None]).any())
     assert bool(agility.exceeds(MODEL.sample(WINDOWS, NUM).position_m[:, :, 0]).any())
+
+
+def test_where_few_keep_the_limits_more_are_drawn_and_what_stays_scarce_says_so() -> None:
+    """Limits from loose to ones that nothing keeps: never a few tracks drawn again and again without a word."""
+    words = []
+    for speed_mps in (8.0, 2.2, 1.9, 1.75, 1.6, 0.3):
+        stated = GuidanceConfig("repair", 0.0, speed_mps * LENGTH_M)
+        here = WINDOWS.with_context(Context(DATUM, obstacles=OBSTACLES))
+        found = dataclasses.replace(MODEL, guidance=stated).sample(here, NUM)
+        for row, (word,) in enumerate(found.status):
+            num_distinct = len(torch.unique(found.position_m[row, :, 0].flatten(1), dim=0))
+            words.append(word)
+            assert word != "ok" or num_distinct >= NUM // 2
+            assert word in ("infeasible", "scarce") or not bool(exceeds(found.position_m[row], speed_mps * LENGTH_M).any())
+    assert {"ok", "infeasible"} <= set(words) <= {"ok", "infeasible", "scarce"}
+
+
+def test_chosen_from_more_draws(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A margin that one draw in four keeps: without more draws two of eight are left, with them all eight differ."""
+    stated = GuidanceConfig("none")
+    finish = Feasibility.finish
+
+    def every_fourth(limits: Feasibility, position_m: torch.Tensor, *args: Any) -> tuple[torch.Tensor, ...]:
+        moved, weight, _ = finish(limits, position_m, *args)
+        is_kept = (torch.arange(position_m.shape[1]) % 4 == 0).expand(position_m.shape[:2])
+        return moved, weight, is_kept
+
+    monkeypatch.setattr(Feasibility, "finish", every_fourth)
+    model = dataclasses.replace(MODEL, guidance=stated)
+    for num_more, word, num_distinct in ((8, "ok", 8), (1, "scarce", 2)):
+        monkeypatch.setattr(general, "_MORE", num_more)
+        found = model.sample(WINDOWS, 8)
+        assert found.status == ((word,), (word,))
+        assert len(torch.unique(found.position_m[0, :, 0].flatten(1), dim=0)) == num_distinct
 
 
 def test_margin_is_kept() -> None:
