@@ -77,7 +77,8 @@ def _motion(speeds: Speeds, scored: Scored | str) -> Iterator[str]:
 
 def _doubts(mission: Mission, analysis: Analysis, num_parted: tuple[int, int]) -> Iterator[str]:
     for record in mission.suspicions:
-        yield f"{record.get('kind', '')} of {record.get('subject', '')}: {record.get('seen', '')}".capitalize()
+        kind, subject, seen, done = (str(record.get(name, "")) for name in ("kind", "subject", "seen", "done"))
+        yield f"{kind[:1].upper()}{kind[1:]} of {subject}: {seen}; {done}."
     if not mission.catalogue.health.is_complete:
         yield "The log is damaged: messages are lost, or may be."
     for status, count in Counter(row.status for row in mission.rows if row.status != "ok").most_common():

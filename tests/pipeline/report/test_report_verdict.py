@@ -166,9 +166,13 @@ def test_what_is_to_doubt_is_said(tmp_path: Path) -> None:
     words = verdict(directory)
     assert "1 of 12 pairs of a window and an agent: no detections." in words
     make_uncertain(directory, {"T1": 0.62})
-    told(directory, "extract", summary={"suspicions": [{"kind": "clock", "subject": "/radar", "seen": "it jumps"}]})
+    told(
+        directory,
+        "extract",
+        summary={"suspicions": [{"kind": "clock", "subject": "/Radar", "seen": "it jumps", "done": "left out"}]},
+    )
     words = verdict(directory)
-    assert "1 of 1 may be none" in words and "Clock of /radar: it jumps" in words
+    assert "1 of 1 may be none" in words and "Clock of /Radar: it jumps; left out." in words
 
 
 def test_agents_that_are_rather_none_are_no_chosen_moments(tmp_path: Path) -> None:
