@@ -201,11 +201,14 @@ class _Origins:
     def remarks(self, seen_ns: Int64s, config: GridConfig) -> list[str]:
         """What is not answered."""
         found = []
-        if self.num_windows < self.num_all:
-            gap_s, back_s = float(np.diff(seen_ns).max()) * 1e-9, config.used_steps * self.step_ns * 1e-9
+        apart_ns = np.diff(self.time_ns)
+        apart_ns = apart_ns[apart_ns > self.stride_ns]
+        in_none_s = (apart_ns - (config.history_steps + config.horizon_steps) * self.step_ns) * 1e-9
+        if (in_none_s > 0).any():
+            gap_s, span_s = float(np.diff(seen_ns).max()) * 1e-9, float(np.ptp(seen_ns)) * 1e-9
             found.append(
-                f"nothing was detected for up to {gap_s:.4g} s, longer than the {back_s:.4g} s that a window looks back: "
-                f"{self.num_all - self.num_windows} windows that would see nothing are not drawn; "
+                f"{_plain(in_none_s[in_none_s > 0].sum())} of the {_plain(span_s)} s from the first detection to the last "
+                f"lie in no window, as nothing was detected for up to {_plain(gap_s)} s; "
                 f"{f'infer.grid.step_s = {_nice(gap_s / _STEPS_PER_GAP):g}' if config.step_s is None else 'a longer step'} "
                 "spans that time"
             )
@@ -215,6 +218,10 @@ class _Origins:
                 f"{config.stride_steps - config.horizon_steps} of every {config.stride_steps} steps are in no window's future"
             )
         return found
+
+
+def _plain(seconds: float) -> str:
+    return f"{seconds:,.0f}" if seconds >= 10.0 else f"{seconds:.2g}"
 
 
 def _nice(value: float) -> float:

@@ -28,6 +28,8 @@ _OPENED_WITH = {
 }
 """What files are for, by the ends of their names, in the order in which they are listed."""
 
+_UNITS = {"s": "s", "m": "m", "mps": "m/s", "bytes": "bytes"}
+
 BATCH_VERSION = 1
 """Version of batch.json."""
 
@@ -159,7 +161,11 @@ def _table(rows: Sequence[Sequence[str]]) -> list[str]:
 
 
 def _named(name: str, value: float) -> str:
-    return f"{name.removeprefix('num_').replace('_', ' ')} {round(value, 3) if isinstance(value, float) else value}"
+    words, _, suffix = name.removeprefix("num_").rpartition("_")
+    number = str(round(value, 3) if isinstance(value, float) else value)
+    if words and suffix in _UNITS:
+        return f"{words.replace('_', ' ')} {number} {_UNITS[suffix]}"
+    return f"{name.removeprefix('num_').replace('_', ' ')} {number}"
 
 
 def _jsonable(value: Any) -> Any:

@@ -180,13 +180,13 @@ def _use_lines(diagnosis: Diagnosis) -> list[str]:
     if diagnosis.no_use:
         return [f"nothing: {diagnosis.no_use}"]
     use = diagnosis.use
-    agents = f"{use['num_agents']} agents" if use["num_agents"] else "agents that are not named"
+    agents = f"{use['num_agents']} agent{'s' * (use['num_agents'] != 1)}" if use["num_agents"] else "agents that are not named"
     counts = [f"{use['num_detections']} detections of {agents}{_topics(use, 'detections')}"]
     if use["num_unknown_origin"] and use["num_agents"]:
         counts.append(f"{use['num_unknown_origin']} of them do not say which agent they are of")
-    for role, name in (("truth", "num_truth"), ("poses", "num_poses")):
+    for role, name, whose in (("truth", "num_truth", "the truth"), ("poses", "num_poses", "sensors")):
         if use[name]:
-            counts.append(f"{use[name]} positions of {role}{_topics(use, role)}")
+            counts.append(f"{use[name]} positions of {whose}{_topics(use, role)}")
     counts += [f"left out: {use[name]} {words}" for name, words in _LEFT_OUT.items() if use[name]]
     return counts + [f"not used, though it may hold detections: {channel}: {why}" for channel, why in use["unused"].items()]
 

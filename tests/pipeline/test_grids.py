@@ -42,8 +42,9 @@ def test_two_passes_are_followed_and_the_time_between_is_said_to_be_left_out() -
     assert not ((seconds > 85.0) & (seconds < 10_070.0)).any()
     assert seconds[-1] >= 10_152.0
     (remark,) = grid.remarks
-    assert remark.startswith("nothing was detected for up to 1e+04 s") and remark.endswith(
-        "infer.grid.step_s = 600 spans that time"
+    assert remark == (
+        "9,991 of the 10,152 s from the first detection to the last lie in no window, as nothing was detected for up to "
+        "10,000 s; infer.grid.step_s = 600 spans that time"
     )
     spanned = plan_grid(table(at(0.0, 10_076.0)), GridConfig(step_s=600.0))
     assert not spanned.remarks
@@ -75,7 +76,9 @@ def test_only_windows_that_see_something_are_drawn_and_the_last() -> None:
     config = GridConfig(step_s=1.0, history_steps=8, horizon_steps=4, stride_steps=4)
     grid = plan_grid(table(np.array([0.0, 3.0, 40.0])), config)
     assert (grid.origins_ns / SECOND_NS).tolist() == [4.0, 8.0, 40.0]
-    assert "7 windows that would see nothing are not drawn; a longer step spans" in grid.remarks[0]
+    assert grid.remarks[0].startswith("20 of the 40 s from the first detection to the last lie in no window")
+    assert grid.remarks[0].endswith("a longer step spans that time")
+    assert not plan_grid(table(np.array([0.0, 3.0, 19.0])), config).remarks, "all of that time lies in some window"
     blind = plan_grid(table(np.array([0.0])), GridConfig(step_s=1.0, history_steps=8, horizon_steps=16, stride_steps=9))
     assert (blind.origins_ns / SECOND_NS).tolist() == [9.0]
 

@@ -100,3 +100,9 @@ def test_scores_as_a_table():
     assert score_lines([]) == []
     result = StageResult("evaluate", "done", (), {"verdict": ["Past: good."], "scores": scores})
     assert stage_summary(result).splitlines()[:2] == ["evaluate: done", "  Past: good."]
+
+
+def test_numbers_of_a_stage_bear_their_units():
+    summary = {"num_ticks": 219, "tick_s": 30.0, "size_bytes": 405597, "plausible_speed_mps": 20.5554, "num_agents": 1}
+    line = stage_summary(StageResult("export", "done", (), summary)).splitlines()[1]
+    assert line == "  ticks 219, tick 30.0 s, size 405597 bytes, plausible speed 20.555 m/s, agents 1"
