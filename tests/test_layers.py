@@ -47,6 +47,7 @@ FLOORS = {
             "presence",
             "obstacle_file",
             "score_words",
+            "stream_words",
             "suspicions",
             "threads",
         },

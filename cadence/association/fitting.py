@@ -1,12 +1,14 @@
-"""What is typical of a stream, found from its detections alone (empirical Bayes): ways to move, rates of detection.
+"""What is typical of a stream, found from its detections alone (empirical Bayes): ways to move, rates of detection, clutter.
 
 The filter begins with ways to move of every scale. Expectation maximisation over its agents finds how often each is met, and
-those that are not met are left out. Where the number of agents is unknown the likelihood of the stream chooses where to begin.
+those that are not met are left out. Where the number of agents or the share of clutter is unknown the likelihood of the stream
+chooses where to begin: a stream that is thought clean makes an agent of every false detection, and goes on doing so.
 """
 
 import dataclasses
 import itertools
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -15,7 +17,7 @@ from cadence.association.motion import Modes
 from cadence.association.particles import Particles, Stream, follow
 from cadence.association.presence import Habits, left_by
 from cadence.association.tracks import Tracks
-from cadence.association.types import AssociationConfig
+from cadence.association.types import CLUTTER, AssociationConfig
 
 _RELAXATIONS = (0.3, 2.0, 12.0, 72.0)
 _SPEEDS = tuple(3.0 ** -np.arange(8.0))
@@ -28,6 +30,9 @@ _FLOOR = 1e-5
 _LEAST_CLUTTER = 1e-6
 """A detection that fits nobody must not rule out all hypotheses, whatever the settings say."""
 _NUM_AGENTS = (3, 10, 30)
+_CLUTTER_SHARES = (0.01, 0.2)
+_CLUTTER_COUNT = 0.5
+"""False detections that are thought to be in a stream before anything is known of it."""
 _FIRST_DEPARTURES = 0.5
 """How many agents are thought to leave within a log before anything is known."""
 _RATE_WEIGHTS = (2.0, 5.0, 15.0, 50.0)
@@ -40,19 +45,36 @@ def fit_habits(stream: Stream, config: AssociationConfig, seed: int, max_speed_m
     """The habits of greatest likelihood for a stream; any sensible ones for a stream that says nothing."""
     part = stream[:_MAX_DETECTIONS]
     numbers = _NUM_AGENTS if config.num_agents is None else (config.num_agents,)
-    tried = [_first_habits(stream, config, number, max_speed_mps) for number in numbers]
+    shares = _CLUTTER_SHARES if config.clutter_share is None else (config.clutter_share,)
+    tried = [[_first_habits(stream, config, number, share, max_speed_mps) for number in numbers] for share in shares]
     if len(stream.time_s) < 2:
-        return tried[len(tried) // 2]
-    runs = [_run(part, habits, seed) for habits in tried]
-    best = int(np.argmax([run[0].log_evidence for run in runs]))
-    habits, run = tried[best], runs[best]
-    for _ in range(_NUM_ROUNDS):
-        habits = _improved(habits, *run, part)
-        run = _run(part, habits, seed)
+        return tried[0][len(numbers) // 2]
+    is_counted = config.clutter_share is None
+    rounds = [_round(part, _likeliest(part, habits, seed), is_counted, seed) for habits in tried]
+    habits, run = max(rounds, key=lambda round_: round_[1][0].log_evidence)
+    for _ in range(_NUM_ROUNDS - 1):
+        habits, run = _round(part, (habits, run), is_counted, seed)
     return habits
 
 
-def _first_habits(stream: Stream, config: AssociationConfig, num_agents: int, max_speed_mps: float | None) -> Habits:
+_Run = tuple[Particles, Float64s]
+"""The particles after a whole stream, and how much each mode was used [C]."""
+
+
+def _likeliest(stream: Stream, tried: Sequence[Habits], seed: int) -> tuple[Habits, _Run]:
+    return max(((habits, _run(stream, habits, seed)) for habits in tried), key=lambda found: found[1][0].log_evidence)
+
+
+def _round(stream: Stream, before: tuple[Habits, _Run], is_counted: bool, seed: int) -> tuple[Habits, _Run]:
+    """Better habits, and what comes of them; `is_counted`: of clutter, too."""
+    habits, run = before
+    improved = _improved(habits, *run, stream, is_counted)
+    return improved, _run(stream, improved, seed)
+
+
+def _first_habits(
+    stream: Stream, config: AssociationConfig, num_agents: int, clutter_share: float, max_speed_mps: float | None
+) -> Habits:
     """Habits of a stream of so many agents that may move in any way."""
     num, sizes = max(len(stream.time_s), 1), np.ptp(stream.position_m, axis=0) if len(stream.time_s) else np.ones(2)
     noise_m = math.sqrt(float(np.trace(stream.covariance_m2.mean(0)))) if len(stream.time_s) else 0.0
@@ -70,7 +92,7 @@ def _first_habits(stream: Stream, config: AssociationConfig, num_agents: int, ma
         rate_memory=_RATE_MEMORIES[1],
         leave_hz=0.0 if is_known else _FIRST_DEPARTURES / span_s,
         num_present=float(num_agents),
-        clutter_hz=max(config.clutter_share, _LEAST_CLUTTER) * num / span_s,
+        clutter_hz=max(clutter_share, _LEAST_CLUTTER) * num / span_s,
         area_m2=float(np.prod(np.maximum(sizes, 0.1 * extent_m))),
         temper=_TEMPER,
         floor_m=_FLOOR * extent_m,
@@ -80,8 +102,7 @@ def _first_habits(stream: Stream, config: AssociationConfig, num_agents: int, ma
     )
 
 
-def _run(stream: Stream, habits: Habits, seed: int) -> tuple[Particles, Float64s]:
-    """The particles after the whole stream, and how much each mode was used [C]."""
+def _run(stream: Stream, habits: Habits, seed: int) -> _Run:
     usage = np.zeros(len(habits.modes))
     switch, share = habits.modes.switch_share, habits.modes.share
     for number, particles in enumerate(follow(stream, habits, _NUM_PARTICLES, seed), -1):
@@ -93,7 +114,7 @@ def _run(stream: Stream, habits: Habits, seed: int) -> tuple[Particles, Float64s
     return particles, usage
 
 
-def _improved(habits: Habits, particles: Particles, usage: Float64s, stream: Stream) -> Habits:
+def _improved(habits: Habits, particles: Particles, usage: Float64s, stream: Stream, is_clutter_counted: bool) -> Habits:
     """Habits after one round: modes as often as they were used, rates as one history of the likeliest particle counts them."""
     share = usage + _PSEUDO_COUNT / len(usage)
     share = share / share.sum()
@@ -104,6 +125,9 @@ def _improved(habits: Habits, particles: Particles, usage: Float64s, stream: Str
     )
     best = np.array([particles.weight.argmax()])
     label = particles.associations(best, np.random.default_rng(0))[0]
+    if is_clutter_counted:
+        span_s = max(float(np.ptp(stream.time_s)), 1e-3)
+        habits = dataclasses.replace(habits, clutter_hz=(float((label == CLUTTER).sum()) + _CLUTTER_COUNT) / span_s)
     gaps_s = [np.diff(stream.time_s[label == agent]) for agent in range(int(label.max()) + 1)]
     watched_s, again = sum(float(gap.sum()) for gap in gaps_s), sum(map(len, gaps_s))
     if again < 1 or watched_s <= 0:

@@ -21,22 +21,22 @@ class AssociationConfig:
     num_particles  association hypotheses that are followed side by side
     num_associations  those that are drawn at a window origin, without bias, from all that the particles stand for; the older
                    name, num_ways, is still read
-    clutter_share  share of the detections that no agent caused
+    clutter_share  share of the detections that no agent caused; None: fitted to the stream
     """
 
     num_agents: int | None = None
     max_agents: int = 64
     num_particles: int = 200
     num_associations: int = field(default=60, metadata={"older_name": "num_ways"})
-    clutter_share: float = 0.01
+    clutter_share: float | None = None
 
     def __post_init__(self) -> None:
         if self.num_agents is not None and self.num_agents < 1:
             raise ValueError("num_agents must be at least 1, or None")
         if min(self.max_agents, self.num_particles, self.num_associations) < 1:
             raise ValueError("max_agents, num_particles and num_associations must be at least 1")
-        if not 0.0 <= self.clutter_share < 1.0:
-            raise ValueError("clutter_share must lie in [0, 1)")
+        if self.clutter_share is not None and not 0.0 <= self.clutter_share < 1.0:
+            raise ValueError("clutter_share must lie in [0, 1), or be None")
 
 
 @dataclass(frozen=True, eq=False)

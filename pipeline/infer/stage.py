@@ -6,9 +6,12 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from cadence.association.counts import stream_counts
+from cadence.association.types import AssociationConfig
 from cadence.constraints.obstacles import Obstacles
 from cadence.errors import ImplausibleInputError
 from pipeline.associations import AssociatedWindows, Sources, build_associated_windows, tell_sources
@@ -25,6 +28,7 @@ from pipeline.manifest import StageResult, run_stage
 from pipeline.missions import CATALOGUE_NAME, no_mission
 from pipeline.obstacle_file import OBSTACLES_NAME, read_obstacles
 from pipeline.progress import Progress
+from pipeline.stream_words import stream_words
 from pipeline.suspicions import Suspicions
 from pipeline.tables import Frame, read_table, write_table
 from pipeline.threads import in_order, num_cores, one_thread
@@ -68,7 +72,7 @@ def infer(
         return {
             **summary,
             "step_s": plan.seen.sources.grid.step_s,
-            "remarks": list(plan.seen.sources.grid.remarks),
+            "remarks": [*plan.seen.sources.grid.remarks, *plan.found],
             "context_steps": plan.seen.sources.grid.context_steps,
             "checkpoint": plan.checkpoint,
             "checkpoint_sha256": _hash(plan.checkpoint),
@@ -150,17 +154,20 @@ class _Seen:
         associated = build_associated_windows(detections, sources, config.seed, config.num_hypotheses, sigma_m)
         return _Seen(sources, named, associated)
 
-    def about(self) -> dict[str, Any]:
+    def about(self, config: AssociationConfig) -> dict[str, Any]:
         """What the summary says of detections of unknown origin; empty where there are none."""
         association = self.sources.association
         if association is None:
             return {}
         at_origins = association.at_origins
+        time_s = association.stream.time_ns[: at_origins[-1].num_detections].astype(np.float64) * 1e-9
         return {
             "association": {
                 "num_detections": len(association.stream),
                 "num_agents": len(association.agent_ids),
                 "mean_num_associations": sum(one.num_associations for one in at_origins) / len(at_origins),
+                "counts": asdict(stream_counts(at_origins[-1], time_s)),
+                "stated": [name for name in ("num_agents", "clutter_share") if getattr(config, name) is not None],
             }
         }
 
@@ -176,13 +183,19 @@ class _Plan:
     suspicions: Suspicions
     max_speed_mps: float | None
 
+    @property
+    def found(self) -> list[str]:
+        """What a stream without identity turned out to be, in words."""
+        words = stream_words(self.about.get("association", {}))
+        return [words] if words else []
+
     @staticmethod
     def of(config: InferConfig, detections: pa.Table, obstacles: Obstacles, start_ns: int) -> "_Plan":
         """The draws of a log by the checkpoint, which decides the grid as well, or by the default one where it does not fit."""
         loaded = load_estimator(config.checkpoint, config.samplings)
         seen = _Seen.of(config, detections, loaded)
         data = FittingData.of(seen.sources.named, seen.sources.grid, seen.named, config.default_sigma_m)
-        suspicions, about = Suspicions(), seen.about()
+        suspicions, about = Suspicions(), seen.about(config.association)
         if config.is_tested and loaded.fit is None:
             test = fit_test(loaded.estimator, data, seen.named.located(start_ns, obstacles))
             if test is not None and test.is_misfit:

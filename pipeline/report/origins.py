@@ -75,9 +75,12 @@ def origins_of(detections: pa.Table, associations: pa.Table) -> Origins:
 
 
 def origins_section(
-    origins: Origins | None, start_ns: int, end_ns: int, presence: Mapping[str, float | None], num_tracked: int
+    origins: Origins | None, start_ns: int, end_ns: int, presence: Mapping[str, float | None], num_tracked: int, found: str
 ) -> str:
-    """A table of the agents that were found, with how likely they are there; empty where the log names its agents."""
+    """A table of the agents that were found, with how likely they are there; empty where the log names its agents.
+
+    `found` says what the stream turned out to be.
+    """
     if origins is None:
         return ""
     clock = Clock(start_ns, end_ns)
@@ -94,7 +97,8 @@ def origins_section(
         f"are rather nobody’s. Of {sure:,} it is at least 90 % sure whose they are, as known at the end of the log. Hypotheses "
         "differ in whose the others are; elsewhere on this page each is shown with its likeliest agent."
     )
-    return section("Agents that were found", content, lead)
+    told = f"<p>{text(found[:1].upper() + found[1:])}.</p>" if found else ""
+    return section("Agents that were found", told + content, lead)
 
 
 def _row(agent: FoundAgent, chance: float | None, num_detections: int, clock: Clock) -> Sequence[str]:

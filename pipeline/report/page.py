@@ -19,6 +19,7 @@ from pipeline.report.sections import moments_section, trouble_section, uncertain
 from pipeline.report.suspicions import suspicions_section
 from pipeline.report.truth import truth_section
 from pipeline.report.verdict import verdict_section
+from pipeline.stream_words import stream_words
 from pipeline.tables import Frame
 from pipeline.tracks import UNKNOWN_AGENT
 
@@ -78,7 +79,7 @@ def write_page(mission: Mission, analysis: Analysis, payload: Payload, moments: 
         _reading(mission),
         _explorer(mission, payload),
         moments_section(mission, analysis, moments),
-        origins_section(mission.origins, mission.start_ns, mission.end_ns, presence, mission.num_tracked),
+        origins_section(mission.origins, mission.start_ns, mission.end_ns, presence, mission.num_tracked, _stream(mission)),
         uncertainty_section(mission, analysis),
         truth_section(mission, analysis),
         trouble_section(mission),
@@ -102,6 +103,12 @@ def _header(mission: Mission) -> str:
     words += [f"zero of its metres at {_latitude_longitude(mission.frame)}"] if mission.frame.is_georeferenced else []
     line = text(" · ".join(words))
     return f"<header><h1>{text(mission.name)}</h1><p>{line}</p>{_thinned(mission)}</header>\n"
+
+
+def _stream(mission: Mission) -> str:
+    """What a stream without identity turned out to be, in words."""
+    summary = mission.manifests.get("infer", {}).get("summary") or {}
+    return stream_words(summary.get("association") or {})
 
 
 def _figures(mission: Mission) -> str:

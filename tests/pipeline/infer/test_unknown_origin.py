@@ -129,7 +129,10 @@ def test_every_association_is_a_window_for_estimators_of_several_agents() -> Non
 def test_hypotheses_pass_through_the_detections_of_their_association(tmp_path: Path) -> None:
     directory = mission(tmp_path, detections())
     result = infer(directory, CONFIG, QUIET)
-    assert result.summary["association"] == {"num_detections": 16, "num_agents": 2, "mean_num_associations": 3.0}
+    found = result.summary["association"]
+    assert (found["num_detections"], found["num_agents"], found["mean_num_associations"]) == (16, 2, 3.0)
+    assert found["counts"]["num_agents"] == 2 and found["counts"]["clutter"]["value"] < 0.05
+    assert any(line.startswith("detections without identity: 2 agents") for line in result.summary["remarks"])
     last = read_hypothesis_tables(directory).windows[-1]
     assert [agent.agent_id for agent in last.agents] == ["a0", "a1"] and last.weight.sum() == pytest.approx(1.0)
     # detection 14 lies at 58 s, y = 0 m; the origin of the second window at 64 s, three steps later
