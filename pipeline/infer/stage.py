@@ -34,6 +34,7 @@ from pipeline.tables import Frame, read_table, write_table
 from pipeline.threads import in_order, num_cores, one_thread
 from pipeline.windows import MissionWindows, build_windows
 
+_MANY_NAMELESS = 2000
 _FIRST_S, _LONG_S = 5.0, 120.0
 """After how long one knows what is ahead, and from when on somebody who waits wants to have been told."""
 
@@ -59,6 +60,12 @@ def infer(
     start_ns = _mission_start_ns(directory, detections)
 
     def body(folder: Path) -> dict[str, Any]:
+        if config.is_associated and detections["agent_id"].null_count > _MANY_NAMELESS:
+            progress.note(
+                f"infer: {detections['agent_id'].null_count} detections do not say whose they are and are told apart one after "
+                'the other, which takes a while; agent = "NAME" in [[extract.detections]] means one target, --start and --end '
+                "take a part"
+            )
         plan = _Plan.of(config, detections, read_obstacles(inputs[1]), start_ns)
         for line in plan.suspicions.lines():
             progress.note(f"infer: suspected {line}")

@@ -36,7 +36,7 @@ from pipeline.infer.config import InferConfig
 from pipeline.infer.draws import draw_associations
 from pipeline.infer.stage import infer
 from pipeline.logs.reader import open_log
-from pipeline.progress import Progress
+from pipeline.progress import Progress, RelayedProgress
 from pipeline.report.stage import ReportConfig, report
 from pipeline.results import read_hypothesis_tables
 from pipeline.tables import Frame, read_table, write_table
@@ -145,6 +145,16 @@ def test_hypotheses_pass_through_the_detections_of_their_association(tmp_path: P
     doubt = [-(p * np.log2(p) + (1 - p) * np.log2(1 - p)) for p in (0.375, 0.125)]
     expected = 0.625 * doubt[0] / 3.625, (0.375 * doubt[0] + 0.875 * doubt[1]) / (3 + 0.375 + 0.875)
     assert [agent.association_entropy_bits for agent in last.agents] == pytest.approx(expected)
+
+
+@pytest.mark.usefixtures("stand_in")
+def test_that_many_detections_have_no_name_is_said_before_one_waits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    told: list[object] = []
+    for most in (16, 15):
+        monkeypatch.setattr("pipeline.infer.stage._MANY_NAMELESS", most)
+        infer(mission(tmp_path / str(most), detections()), CONFIG, RelayedProgress(tell=told.append))
+    (note,) = [line for line in told if isinstance(line, str) and "do not say whose they are" in line]
+    assert note.startswith("infer: 16 detections") and 'agent = "NAME"' in note
 
 
 @pytest.mark.usefixtures("stand_in")
