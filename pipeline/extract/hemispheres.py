@@ -16,6 +16,7 @@ Mirrored = Literal["exchanged", "other side of Greenwich", "other side of the eq
 
 _NEAR_DEG: Final = 1.0
 _FAR_DEG: Final = 5.0
+_MAX_ROWS: Final = 2048
 _MAX_SOURCES: Final = 12
 """Of many that are spread over the earth some are each other's mirror images by chance."""
 _MIRRORS: Final[Mapping[Mirrored, tuple[tuple[int, int], tuple[int, int]]]] = {  # which coordinates, with which signs
@@ -30,14 +31,15 @@ Sources = Mapping[str, Sequence[tuple[ChannelReader, Positions]]]
 
 def check_hemispheres(parts: Sources, suspicions: Suspicions) -> None:
     """Tell of sources, by role, that lie far from all others, but near them when mirrored; which are right nobody knows."""
-    places = {
-        reader.channel.topic: np.array([np.nanmedian(rows.first), np.nanmedian(rows.second)])
+    sources = {
+        reader.channel.topic: rows
         for found in parts.values()
         for reader, rows in found
-        if len(rows) and rows.is_geodetic.all() and reader.source.unit is None and np.isfinite(rows.first).any()
+        if len(rows) and rows.is_geodetic.all() and reader.source.unit is None and np.isfinite(rows.first + rows.second).any()
     }
-    if not 1 < len(places) <= _MAX_SOURCES or not suspicions.looks_for("place"):
+    if not 1 < len(sources) <= _MAX_SOURCES or not suspicions.looks_for("place"):
         return
+    places = {topic: _place(rows) for topic, rows in sources.items()}
     told: set[str] = set()
     for topic, place in places.items():
         others = {name: there for name, there in places.items() if name != topic}
@@ -49,6 +51,13 @@ def check_hemispheres(parts: Sources, suspicions: Suspicions) -> None:
             if near and topic not in told:
                 told |= {topic, *near}
                 _tell(topic, place, mirrored, near, suspicions)
+
+
+def _place(rows: Positions) -> np.ndarray:
+    """Median latitude and longitude [2] of what is finite."""
+    places = np.column_stack([rows.first, rows.second])
+    places = places[np.isfinite(places).all(axis=1)]
+    return np.asarray(np.median(places[:: 1 + len(places) // _MAX_ROWS], axis=0))
 
 
 def _apart_deg(one: np.ndarray, other: np.ndarray) -> float:
