@@ -25,7 +25,7 @@ from cadence.bank.mixture import (
     mixture_moments,
     random_numbers,
 )
-from cadence.bank.rows import active_rows, scatter_hypotheses, track_rows
+from cadence.bank.rows import active_rows, scatter_hypotheses, spaced, track_rows
 from cadence.bank.smoother import Filtered, Nodes, backward_kernel, draw, filter_forward, smooth
 from cadence.bank.switching import SwitchingModels, continue_moments, continue_samples, durations_after
 from cadence.types import Detections, HypothesisSet, WindowBatch
@@ -57,7 +57,10 @@ class Bank:
     later_weight [C] weights of the models that take over after the last detection; the prior weights where None
     speed_mps    the log's typical speed: one step length is speed_mps * step_s; None until fitted
     switch_rate  how often, per step, the model changes after the last detection
-    temper       exponent of the likelihood when models are weighed: below one, as every model is wrong a little
+    temper       exponent of the likelihood when models are weighed
+    spacing_steps  detections closer than this say nothing when models are weighed: short steps within bursts, which are not
+                 what is asked for, would rule
+    noise_steps  standard deviation an axis that detections have beside their own, in step lengths
     pseudo_count how many stretches' worth of evidence the flat prior over models holds against the log
     """
 
@@ -66,7 +69,9 @@ class Bank:
     later_weight: Tensor | None = None
     speed_mps: float | None = None
     switch_rate: float = 1.0 / 32.0
-    temper: float = 0.3
+    temper: float = 1.0
+    spacing_steps: float = 1.0
+    noise_steps: float = 0.0
     pseudo_count: float = 3.0
     name: str = "bank"
 
@@ -85,15 +90,18 @@ class Bank:
         rows = rows[rows.is_observed.sum(-1) > 1]
         if len(rows.time_s) == 0:
             return dataclasses.replace(self, speed_mps=speed_mps)
-        models = concatenate(self.models, fit_ornstein_uhlenbeck(rows, step_s, speed_mps))
-        log_weight, evidence = em_weights(log_likelihood(models, rows, step_s, speed_mps), self.pseudo_count)
+        telling = spaced(rows, self.spacing_steps * step_s)
+        models = concatenate(self.models, fit_ornstein_uhlenbeck(telling, step_s, speed_mps))
+        log_weight, evidence = em_weights(log_likelihood(models, telling, step_s, speed_mps), self.pseudo_count)
         return dataclasses.replace(self, models=models, log_weight=log_weight, later_weight=evidence, speed_mps=speed_mps)
 
     def posterior(self, windows: WindowBatch, num_hypotheses: int) -> BankPosterior:
         """Moments and joint samples for the active agents of `windows`, rows in the order of `is_active.nonzero()`."""
         rows, seeds = active_rows(windows)
         floor_m = FLOOR_STEPS * self._speed() * windows.step_s
-        evidence = log_likelihood(self.models, rows, windows.step_s, self._speed())
+        rows = with_floor(rows, self.noise_steps * self.length_m(windows.step_s))
+        telling = spaced(rows, self.spacing_steps * windows.step_s)
+        evidence = log_likelihood(self.models, telling, windows.step_s, self._speed())
         log_posterior = self.temper * evidence + self._log_weight()
         parts = []
         nodes = with_floor(rows, floor_m)
@@ -112,6 +120,17 @@ class Bank:
     def sample(self, windows: WindowBatch, num_hypotheses: int) -> HypothesisSet:
         """Joint samples of the bank itself: the rival and release gate of the diffusion model."""
         return scatter_hypotheses(self.posterior(windows, num_hypotheses).sample_m, windows)
+
+    def about(self) -> dict[str, float | int | None]:
+        """What a summary says of it."""
+        return {"speed_mps": self.speed_mps, "switch_rate": self.switch_rate, "num_models": len(self.models)}
+
+    def only(self, is_member: Tensor) -> "Bank":
+        """The bank without the models [C] that are no members: weights shared out among the others."""
+        later = self._log_weight().exp() if self.later_weight is None else self.later_weight
+        later = torch.where(is_member, later if bool(later[is_member].any()) else self._log_weight().exp(), 0.0)
+        log_weight = torch.where(is_member, self._log_weight(), -torch.inf)
+        return dataclasses.replace(self, log_weight=log_weight.log_softmax(0), later_weight=later / later.sum())
 
     def length_m(self, step_s: float) -> float:
         """One step length: the way at the log's typical speed in a step."""
@@ -182,7 +201,7 @@ class Bank:
 class _Smoothed:
     """Rows between their detections: the mixture on the grid, and what is needed to go on after the last detection.
 
-    mean_m [R, T, 2], variance_m2 [R, T], sample_m [R, K, T, 2]; state [R, K, M, 4] of the samples at the nodes, pair [R, K]
+    mean_m [R, T, 2], variance_m2 [R, T], sample_m [R, K, T, 2]; state [R, K, M, S] of the samples at the nodes, pair [R, K]
     which pair of row and model drew them, last_node [R] of the last detection.
     """
 
@@ -217,9 +236,9 @@ def _smooth_rows(
     variance = (0.5 * (node_covariance[..., 0, 0] + node_covariance[..., 1, 1])).gather(1, pick)
     mean, variance = mixture_moments(mean, variance, chosen)
     num_nodes = nodes.time_s.shape[1]
-    numbers = random_numbers(chosen.weight, rows, seeds, num_hypotheses, num_nodes, len(time_s))
+    numbers = random_numbers(chosen.weight, rows, seeds, num_hypotheses, num_nodes, len(time_s), filtered.mean.shape[-1])
     pair = chosen.first_pair[:, None] + numbers.owner
-    state = draw(backward, pair.flatten(), numbers.normal.flatten(0, 1)).view(len(mean), num_hypotheses, -1, 4)
+    state = draw(backward, pair.flatten(), numbers.normal.flatten(0, 1)).view(len(mean), num_hypotheses, num_nodes, -1)
     sample = state[..., :2].gather(2, step_index[:, None, :, None].expand(-1, num_hypotheses, -1, 2))
     last_node = (nodes.is_observed * torch.arange(1, num_nodes + 1)).argmax(1)
     return _Smoothed(chosen, filtered, numbers, mean, variance, sample, state, pair, last_node)

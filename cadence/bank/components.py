@@ -6,6 +6,13 @@ With the plane read as complex numbers, position p and velocity v follow
 
 which is constant velocity for no relaxation and no turn, integrated Ornstein-Uhlenbeck with relaxation, and a coordinated
 turn with a turn rate (Bar-Shalom, Li, Kirubarajan, "Estimation with Applications to Tracking and Navigation", ch. 6 and 11).
+
+A target that stays about a place has a centre c besides, which is constant and unknown, and is drawn back to it:
+
+    dp = v dt,    dv = (-1/relaxation v - (speed/range)^2 (p - c)) dt + noise,    dc = 0
+
+a damped oscillator whose stationary law has the deviations `range` of position and `speed` of velocity (the OUF process of
+Fleming, Calabrese et al., "From fine-scale foraging to home ranges", American Naturalist 183, 2014).
 Everything is closed form, so that detections may lie at any times.
 """
 
@@ -16,6 +23,8 @@ from types import EllipsisType
 import torch
 from torch import Tensor
 
+from cadence.bank.oscillator import NODES, WEIGHTS, oscillator
+
 
 @dataclass(frozen=True, eq=False)
 class MotionModels:
@@ -25,15 +34,19 @@ class MotionModels:
     turn_rate        rad/s, positive to the left
     diffusion        m^2/s^3 and axis: intensity of the acceleration noise
     initial_speed    m/s and axis: standard deviation of the velocity where nothing is known yet
+    home_range       m and axis: standard deviation about the centre that a target is drawn back to; infinite without one
+    num_states       length of the state: 4, or 6 in a bank where any model has a home
     """
 
     relaxation_rate: Tensor
     turn_rate: Tensor
     diffusion: Tensor
     initial_speed: Tensor
+    home_range: Tensor
+    num_states: int = 4
 
     def __post_init__(self) -> None:
-        shapes = {tuple(value.shape) for value in (self.relaxation_rate, self.turn_rate, self.diffusion, self.initial_speed)}
+        shapes = {tuple(value.shape) for value in self.columns}
         if len(shapes) != 1 or self.relaxation_rate.ndim != 1:
             raise ValueError(f"MotionModels: parameters must share one shape [C], got {sorted(shapes)}")
 
@@ -42,9 +55,17 @@ class MotionModels:
 
     def __getitem__(self, index: Tensor) -> "MotionModels":
         """The models at `index` [P]; repeats are allowed."""
-        return MotionModels(
-            self.relaxation_rate[index], self.turn_rate[index], self.diffusion[index], self.initial_speed[index]
-        )
+        return MotionModels(*(value[index] for value in self.columns), self.num_states)
+
+    @property
+    def columns(self) -> tuple[Tensor, ...]:
+        """The five parameters."""
+        return self.relaxation_rate, self.turn_rate, self.diffusion, self.initial_speed, self.home_range
+
+    @property
+    def has_home(self) -> Tensor:
+        """Which models draw a target back to a centre [C]."""
+        return self.home_range.isfinite()
 
     def scaled(self, step_s: float, speed_mps: float) -> "MotionModels":
         """The same models brought from units of steps and step lengths (speed times step) to seconds and metres."""
@@ -53,26 +74,35 @@ class MotionModels:
             self.turn_rate / step_s,
             self.diffusion * speed_mps**2 / step_s,
             self.initial_speed * speed_mps,
+            self.home_range * speed_mps * step_s,
+            self.num_states,
         )
 
 
 def constant_velocity(diffusion: list[float], initial_speed: float = 1.5) -> MotionModels:
     """Constant velocity with white acceleration noise."""
     zero = torch.zeros(len(diffusion), dtype=torch.float64)
-    return MotionModels(zero, zero, torch.tensor(diffusion, dtype=torch.float64), zero + initial_speed)
+    return MotionModels(zero, zero, torch.tensor(diffusion, dtype=torch.float64), zero + initial_speed, zero + torch.inf)
 
 
 def ornstein_uhlenbeck(relaxation: list[float], speed: list[float], turn_rate: list[float]) -> MotionModels:
     """All combinations of relaxation time, stationary speed an axis and turn rate; starts in its stationary law."""
     grid = torch.tensor(list(itertools.product(relaxation, speed, turn_rate)), dtype=torch.float64)
     time, sigma, turn = grid.unbind(-1)
-    return MotionModels(1.0 / time, turn, 2.0 * sigma**2 / time, sigma)
+    return MotionModels(1.0 / time, turn, 2.0 * sigma**2 / time, sigma, torch.full_like(time, torch.inf))
+
+
+def home_ranges(relaxation: list[float], speed: list[float], size: list[float]) -> MotionModels:
+    """All combinations of relaxation time, stationary speed and stationary distance from the centre, each an axis."""
+    grid = torch.tensor(list(itertools.product(relaxation, speed, size)), dtype=torch.float64)
+    time, sigma, distance = grid.unbind(-1)
+    return MotionModels(1.0 / time, torch.zeros_like(time), 2.0 * sigma**2 / time, sigma, distance, num_states=6)
 
 
 def concatenate(*models: MotionModels) -> MotionModels:
     """One bank of several."""
-    columns = ("relaxation_rate", "turn_rate", "diffusion", "initial_speed")
-    return MotionModels(*(torch.cat([getattr(model, name) for model in models]) for name in columns))
+    columns = (torch.cat(column) for column in zip(*(model.columns for model in models), strict=True))
+    return MotionModels(*columns, max(model.num_states for model in models))
 
 
 def default_models() -> MotionModels:
@@ -83,6 +113,7 @@ def default_models() -> MotionModels:
         ornstein_uhlenbeck([1.0, 3.0, 10.0, 30.0, 100.0], [0.03, 0.1, 0.3, 0.7, 1.5], [0.0]),
         ornstein_uhlenbeck([0.3, 1.0], [2.5, 5.0], [0.0]),
         ornstein_uhlenbeck([30.0, 300.0], [0.7], turns),
+        home_ranges([2.0, 10.0], [0.5, 1.0], [1.0, 3.0, 10.0, 30.0]),
     )
 
 
@@ -94,7 +125,8 @@ def transition(models: MotionModels, duration: Tensor) -> tuple[Tensor, Tensor]:
         duration: [P, ...] non-negative, in the time unit of the models.
 
     Returns:
-        Matrices [P, ..., 4, 4] for the state (x, y, vx, vy): the transition and the noise covariance.
+        Matrices [P, ..., S, S] for the state (x, y, vx, vy), of models with a home for (x, y, vx, vy, centre x, centre y): the
+        transition and the noise covariance. Where some models have a home the state of all has a centre.
     """
     extra = (...,) + (None,) * (duration.ndim - 1)
     rate = torch.complex(-models.relaxation_rate, models.turn_rate)[extra].expand(duration.shape)
@@ -102,7 +134,8 @@ def transition(models: MotionModels, duration: Tensor) -> tuple[Tensor, Tensor]:
     growth = torch.exp(z)
     gain = duration * _phi1(z)
     noise_pp, noise_pv, noise_vv = _noise(models, rate, duration, z, extra)
-    matrix = torch.zeros(*duration.shape, 4, 4, dtype=torch.float64)
+    size = models.num_states
+    matrix = torch.zeros(*duration.shape, size, size, dtype=torch.float64)
     noise = torch.zeros_like(matrix)
     _put_complex(matrix, 0, 0, torch.ones_like(gain))
     _put_complex(matrix, 0, 2, gain)
@@ -111,7 +144,16 @@ def transition(models: MotionModels, duration: Tensor) -> tuple[Tensor, Tensor]:
     _put_complex(noise, 0, 2, noise_pv)
     _put_complex(noise, 2, 0, noise_pv.conj())
     _put_complex(noise, 2, 2, torch.complex(noise_vv, torch.zeros_like(noise_vv)))
+    if size > 4:
+        _put_complex(matrix, 4, 4, torch.ones_like(gain))
+        home = models.has_home
+        matrix[home], noise[home] = _about_home(models[home], duration[home], extra)
     return matrix, noise
+
+
+def _about_home(models: MotionModels, duration: Tensor, extra: tuple[EllipsisType | None, ...]) -> tuple[Tensor, Tensor]:
+    columns = (models.relaxation_rate, models.initial_speed, models.home_range)
+    return oscillator(*(column[extra].expand(duration.shape) for column in columns), duration)
 
 
 def _put_complex(matrix: Tensor, row: int, column: int, value: Tensor) -> None:
@@ -129,10 +171,6 @@ def _phi1(z: Tensor) -> Tensor:
     return torch.where(is_small, series, (torch.exp(safe) - 1.0) / safe)
 
 
-_NODES = torch.tensor([0.0694318442029737, 0.3300094782075719, 0.6699905217924281, 0.9305681557970263], dtype=torch.float64)
-_WEIGHTS = torch.tensor([0.1739274225687269, 0.3260725774312731, 0.3260725774312731, 0.1739274225687269], dtype=torch.float64)
-
-
 def _noise(
     models: MotionModels, rate: Tensor, duration: Tensor, z: Tensor, extra: tuple[EllipsisType | None, ...]
 ) -> tuple[Tensor, Tensor, Tensor]:
@@ -147,10 +185,10 @@ def _noise(
     first = d * _phi1(a * d)
     pp_closed = (vv_closed - 2.0 * first.real + d) / (a.abs() ** 2)
     pv_closed = (torch.complex(vv_closed, torch.zeros_like(d)) - first.conj()) / a
-    s = duration[..., None] * _NODES
+    s = duration[..., None] * NODES
     response = s * _phi1(rate[..., None] * s)
     velocity = torch.exp(rate[..., None] * s)
-    weight = duration[..., None] * _WEIGHTS
+    weight = duration[..., None] * WEIGHTS
     pp_small = (weight * response.abs() ** 2).sum(-1)
     pv_small = (weight * response * velocity.conj()).sum(-1)
     vv_small = (weight * velocity.abs() ** 2).sum(-1)

@@ -5,39 +5,22 @@ Detections after a window's origin, and bursts withheld inside it, tell — with
 """
 
 import dataclasses
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
-from cadence.bank.bank import Bank
 from cadence.types import Detections, Estimator, WindowBatch
 
+Test = tuple[WindowBatch, Detections]
+"""Windows, and detections that they do not hold."""
+
 NUM_SAMPLES = 24
-_WITHHELD_STEPS = 1.5
+_APART_STEPS = 1.5
+_GAP_STEPS = 16.0
+"""The gap in which a random moment lies, as grids are planned."""
 LEAST_TESTS = 8
 """Detections without which nothing is chosen."""
-
-
-def candidates(bank: Bank) -> tuple[Bank, ...]:
-    """The settings to choose from: models that change rarely or often, and the one fitted Ornstein-Uhlenbeck model alone."""
-    only_last = torch.zeros(len(bank.models), dtype=torch.float64)
-    only_last[-1] = 1.0
-    return (
-        dataclasses.replace(bank, switch_rate=1.0 / 32.0),
-        dataclasses.replace(bank, switch_rate=1.0 / 128.0),
-        dataclasses.replace(bank, log_weight=only_last.log(), later_weight=only_last, switch_rate=0.0),
-    )
-
-
-def choose_by_hindsight(bank: Bank, windows: WindowBatch, later: Detections) -> Bank:
-    """The candidate with the least mean of `hindsight_scores` at the detections `later` [B, A, N] after each window's origin.
-
-    Without enough of them the bank stays as it is.
-    """
-    if windows.num_windows == 0 or num_tests(windows, later) < LEAST_TESTS or bank.log_weight is None:
-        return bank
-    scores = [float(hindsight_scores(candidate, windows, later).mean()) for candidate in candidates(bank)]
-    return candidates(bank)[scores.index(min(scores))]
 
 
 def num_tests(windows: WindowBatch, shown_later: Detections) -> int:
@@ -57,20 +40,40 @@ def scores_in_hindsight(position_m: Tensor, windows: WindowBatch, shown_later: D
     window, so that long gaps do not rule alone.
 
     Args:
-        position_m: [B, NUM_SAMPLES, A, T, 2] hypotheses of equal weight.
+        position_m: [B, K, A, T, 2] hypotheses of equal weight, independent of each other.
         windows: what they were drawn from.
         shown_later: the detections to compare with.
     """
-    foreseen, is_used = at_detections(position_m, windows, shown_later)
-    error = (foreseen - shown_later.position_m[:, None]).norm(dim=-1).mean(1)
-    # half of the samples against the other half: an unbiased estimate of the mean distance between two of them
-    half = NUM_SAMPLES // 2
-    spread = (foreseen[:, :half] - foreseen[:, half:]).norm(dim=-1).mean(1)
+    error, distance = distances([position_m], windows, shown_later)
+    return error[:, 0] - 0.5 * distance[:, 0, 0]
+
+
+def distances(positions_m: Sequence[Tensor], windows: WindowBatch, shown_later: Detections) -> tuple[Tensor, Tensor]:
+    """What energy scores of M sets of hypotheses, and of all mixtures of them, consist of; arguments and R as above.
+
+    Returns:
+        Mean distance of each set to the detections [R, M], and between two sets [R, M, M], of a set to itself without bias.
+    """
+    foreseen = [at_detections(position_m, windows, shown_later)[0] for position_m in positions_m]
+    is_used = _is_used(windows, shown_later)
+    scale = _scale(windows, shown_later)
+
+    def mean(value: Tensor) -> Tensor:
+        return (torch.where(is_used, value / scale, 0.0).sum(-1) / is_used.sum(-1).clamp_min(1))[is_used.any(-1)]
+
+    error = [mean((one - shown_later.position_m[:, None]).norm(dim=-1).mean(1)) for one in foreseen]
+    # half of the samples against the other half: an unbiased estimate of the mean distance between two of a set
+    half = foreseen[0].shape[1] // 2
+    between = [[mean((one[:, :half] - other[:, half:]).norm(dim=-1).mean(1)) for other in foreseen] for one in foreseen]
+    distance = torch.stack([torch.stack(row, -1) for row in between], -2)
+    return torch.stack(error, -1), 0.5 * (distance + distance.mT)
+
+
+def _scale(windows: WindowBatch, shown_later: Detections) -> Tensor:
+    """Seconds from each detection [B, A, N] to the nearest one in its window, at least a step."""
     distance_s = (shown_later.time_s[..., None] - windows.detections.time_s[..., None, :]).abs()
     known = windows.detections.is_observed[..., None, :]
-    scale = torch.where(known, distance_s, torch.inf).amin(-1).clamp_min(windows.step_s)
-    score = torch.where(is_used, (error - 0.5 * spread) / scale, 0.0).sum(-1) / is_used.sum(-1).clamp_min(1)
-    return score[is_used.any(-1)]
+    return torch.where(known, distance_s, torch.inf).amin(-1).clamp_min(windows.step_s)
 
 
 def at_detections(position_m: Tensor, windows: WindowBatch, shown_later: Detections) -> tuple[Tensor, Tensor]:
@@ -85,15 +88,18 @@ def at_detections(position_m: Tensor, windows: WindowBatch, shown_later: Detecti
 
 
 def withhold(windows: WindowBatch, seed: int) -> tuple[WindowBatch, Detections]:
-    """The windows without one burst each, chosen at random among all but the first and the last detection, and that burst."""
+    """The windows without one whole burst of detections an agent, neither the first nor the last, and what was withheld.
+
+    A longer gap remains without it. Of the bursts the one is chosen after which the gap is most like those that are asked for;
+    `seed` decides between equals. Agents with fewer than three bursts keep all.
+    """
     detections = windows.detections
-    generator = torch.Generator().manual_seed(seed)
-    draw = torch.rand(detections.time_s.shape, generator=generator)
-    index = torch.arange(detections.time_s.shape[2])
-    is_inner = detections.is_observed & (index > 0) & (index < detections.count[..., None] - 1)
-    chosen = torch.where(is_inner, draw, -1.0).argmax(-1, keepdim=True)
-    distance_s = (detections.time_s - detections.time_s.gather(2, chosen)).abs()
-    is_withheld = is_inner & is_inner.any(-1, keepdim=True) & (distance_s <= _WITHHELD_STEPS * windows.step_s)
+    burst = _bursts(detections, _APART_STEPS * windows.step_s)
+    gap_s = _gaps_without(detections, burst)
+    unlike = (gap_s / (_GAP_STEPS * windows.step_s)).log().abs()
+    unlike = unlike + 1e-6 * torch.rand(unlike.shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    chosen = torch.where(gap_s.isfinite(), unlike, torch.inf).argmin(-1, keepdim=True)
+    is_withheld = detections.is_observed & (burst == chosen) & gap_s.isfinite().any(-1, keepdim=True)
     # padding belongs last: what is kept moves to the front, in order
     order = torch.argsort((~(detections.is_observed & ~is_withheld)).to(torch.int8), dim=-1, stable=True)
     kept = Detections(
@@ -104,6 +110,21 @@ def withhold(windows: WindowBatch, seed: int) -> tuple[WindowBatch, Detections]:
     )
     withheld = dataclasses.replace(detections, is_observed=is_withheld)
     return dataclasses.replace(windows, detections=kept), withheld
+
+
+def _bursts(detections: Detections, apart_s: float) -> Tensor:
+    """Which burst of its agent each detection belongs to [B, A, N], counted from zero: they lie more than `apart_s` apart."""
+    is_new = (detections.time_s.diff(dim=-1) > apart_s) & detections.is_observed[..., 1:]
+    return torch.nn.functional.pad(is_new.cumsum(-1), (1, 0))
+
+
+def _gaps_without(detections: Detections, burst: Tensor) -> Tensor:
+    """Length in seconds of the gap that remains without each burst [B, A, bursts]; infinite for the first and the last."""
+    time_s, observed = detections.time_s.double(), detections.is_observed
+    never = torch.full((*burst.shape[:2], burst.shape[2] + 1), torch.inf, dtype=torch.float64)
+    begin_s = never.scatter_reduce(2, burst, torch.where(observed, time_s, torch.inf), "amin")
+    end_s = (-never).scatter_reduce(2, burst, torch.where(observed, time_s, -torch.inf), "amax")
+    return torch.cat([never[..., :1], begin_s[..., 2:] - end_s[..., :-2]], dim=-1)
 
 
 def _is_used(windows: WindowBatch, shown_later: Detections) -> Tensor:

@@ -30,8 +30,8 @@ class Numbers:
     """Random numbers of each row's own seed.
 
     owner   [R, K] which of the row's chosen models draws the hypothesis
-    normal  [R, K, M, 4] for the nodes
-    uniform [R, K, T, 2] and kick [R, K, T, 4] for the continuation after the last detection
+    normal  [R, K, M, S] for the nodes
+    uniform [R, K, T, 2] and kick [R, K, T, S] for the continuation after the last detection
     """
 
     owner: Tensor
@@ -55,8 +55,8 @@ def at_node(filtered: Filtered, chosen: Chosen, index: Tensor, node: Tensor, num
     num_rows = len(node)
     pair = torch.arange(len(chosen.row))
     at = node[chosen.row]
-    mean = torch.zeros(num_rows, num_models, 4, dtype=torch.float64)
-    covariance = torch.zeros(num_rows, num_models, 4, 4, dtype=torch.float64)
+    mean = torch.zeros(num_rows, num_models, *filtered.mean.shape[2:], dtype=torch.float64)
+    covariance = torch.zeros(num_rows, num_models, *filtered.covariance.shape[2:], dtype=torch.float64)
     weight = torch.zeros(num_rows, num_models, dtype=torch.float64)
     mean[chosen.row, index] = filtered.mean[pair, at]
     covariance[chosen.row, index] = filtered.covariance[pair, at]
@@ -97,16 +97,18 @@ def mixture_moments(mean: Tensor, variance: Tensor, chosen: Chosen) -> tuple[Ten
     return total, mixed
 
 
-def random_numbers(weight: Tensor, rows: Nodes, seeds: Tensor, num_hypotheses: int, num_nodes: int, num_steps: int) -> Numbers:
+def random_numbers(
+    weight: Tensor, rows: Nodes, seeds: Tensor, num_hypotheses: int, num_nodes: int, num_steps: int, size: int
+) -> Numbers:
     """Each row draws from its own seed and only for its own nodes, so that its neighbours in the batch do not matter.
 
-    Models are allotted to hypotheses by systematic resampling, in random order.
+    Models are allotted to hypotheses by systematic resampling, in random order; states have length `size`.
     """
     num_rows, k = len(weight), num_hypotheses
     owner = torch.empty(num_rows, k, dtype=torch.int64)
-    normal = torch.zeros(num_rows, k, num_nodes, 4, dtype=torch.float64)
+    normal = torch.zeros(num_rows, k, num_nodes, size, dtype=torch.float64)
     uniform = torch.empty(num_rows, k, num_steps, 2, dtype=torch.float64)
-    kick = torch.empty(num_rows, k, num_steps, 4, dtype=torch.float64)
+    kick = torch.empty(num_rows, k, num_steps, size, dtype=torch.float64)
     num_detections = rows.is_observed.sum(-1).tolist()
     for row, seed in enumerate(seeds.tolist()):
         generator = torch.Generator().manual_seed(seed)
@@ -114,10 +116,10 @@ def random_numbers(weight: Tensor, rows: Nodes, seeds: Tensor, num_hypotheses: i
         order = torch.randperm(k, generator=generator)
         owner[row] = torch.from_numpy(systematic(weight[row].numpy(), k, start))[order]
         used = num_steps + num_detections[row]
-        drawn = torch.randn(k, used, 4, generator=generator, dtype=torch.float64)
+        drawn = torch.randn(k, used, size, generator=generator, dtype=torch.float64)
         normal[row, :, : used - 1] = drawn[:, :-1]
         # samples are drawn backwards from the last node, which may be padding: its numbers are the ones that spread the end
         normal[row, :, -1] = drawn[:, -1]
         uniform[row] = torch.rand(k, num_steps, 2, generator=generator, dtype=torch.float64)
-        kick[row] = torch.randn(k, num_steps, 4, generator=generator, dtype=torch.float64)
+        kick[row] = torch.randn(k, num_steps, size, generator=generator, dtype=torch.float64)
     return Numbers(owner, normal, uniform, kick)

@@ -52,3 +52,20 @@ def track_rows(tracks: Detections) -> Nodes:
     seeds = torch.zeros(len(tracks.time_s), dtype=torch.int64)
     rows, _ = active_rows(WindowBatch(torch.zeros(1), tracks, seeds, 0))
     return rows
+
+
+def spaced(rows: Nodes, spacing_s: float) -> Nodes:
+    """The same rows without detections that lie less than `spacing_s` before the next one that is kept; the last one is."""
+    if not len(rows.time_s):
+        return rows
+    is_kept = torch.zeros_like(rows.is_observed)
+    newer_s = torch.full((len(rows.time_s),), torch.inf, dtype=torch.float64)
+    for index in range(rows.time_s.shape[1] - 1, -1, -1):
+        keep = rows.is_observed[:, index] & (newer_s - rows.time_s[:, index] >= spacing_s)
+        is_kept[:, index] = keep
+        newer_s = torch.where(keep, rows.time_s[:, index], newer_s)
+    order = torch.argsort((~is_kept).to(torch.int8), dim=1, stable=True)[:, : max(1, int(is_kept.sum(1).amax()))]
+    is_kept = is_kept.gather(1, order)
+    time_s = torch.where(is_kept, rows.time_s.gather(1, order), -torch.inf).cummax(dim=1).values
+    position_m = rows.position_m.gather(1, order[..., None].expand(-1, -1, 2))
+    return Nodes(time_s, position_m, rows.covariance_m2.gather(1, order[..., None, None].expand(-1, -1, 2, 2)), is_kept)

@@ -37,7 +37,7 @@ class Nodes:
 
 @dataclass(frozen=True, eq=False)
 class Filtered:
-    """Filter output: moments after each node's update [P, M, 4(, 4)], transitions into it, and the log likelihood [P]."""
+    """Filter output: moments after each node's update [P, M, S(, S)], transitions into it, and the log likelihood [P]."""
 
     mean: Tensor
     covariance: Tensor
@@ -50,8 +50,8 @@ class Filtered:
 class Backward:
     """The backward kernel x[m] = gain x[m + 1] + offset + root n, which smooths (n = 0 in the mean) and samples.
 
-    gain [P, M - 1, 4, 4], offset [P, M - 1, 4], root [P, M - 1, 4, 4] lower triangular; the last node's law is in
-    `mean` [P, 4] and `last_root` [P, 4, 4].
+    gain [P, M - 1, S, S], offset [P, M - 1, S], root [P, M - 1, S, S] lower triangular; the last node's law is in
+    `mean` [P, S] and `last_root` [P, S, S].
     """
 
     gain: Tensor
@@ -76,12 +76,7 @@ def filter_forward(models: MotionModels, nodes: Nodes, position_sigma_m: Tensor)
     duration = torch.diff(nodes.time_s, dim=1, prepend=nodes.time_s[:, :1])
     matrix, noise = transition(models, duration)
     first = nodes.is_observed.to(torch.int64).argmax(dim=1)
-    mean = torch.zeros(num_rows, 4, dtype=torch.float64)
-    mean[:, :2] = nodes.position_m[torch.arange(num_rows), first]
-    covariance = torch.zeros(num_rows, 4, 4, dtype=torch.float64)
-    for axis in (0, 1):
-        covariance[:, axis, axis] = position_sigma_m**2
-        covariance[:, axis + 2, axis + 2] = models.initial_speed**2
+    mean, covariance = _start(models, nodes.position_m[torch.arange(num_rows), first], position_sigma_m)
     log_likelihood = torch.zeros(num_rows, dtype=torch.float64)
     means, covariances = [], []
     for m in range(num_nodes):
@@ -96,6 +91,21 @@ def filter_forward(models: MotionModels, nodes: Nodes, position_sigma_m: Tensor)
         means.append(mean)
         covariances.append(covariance)
     return Filtered(torch.stack(means, 1), torch.stack(covariances, 1), matrix, noise, log_likelihood)
+
+
+def _start(models: MotionModels, position_m: Tensor, sigma_m: Tensor) -> tuple[Tensor, Tensor]:
+    """A diffuse position, or a diffuse centre and the stationary law about it."""
+    size = models.num_states
+    mean = position_m.repeat(1, size // 2)
+    mean[:, 2:4] = 0.0
+    covariance = torch.zeros(len(mean), size, size, dtype=torch.float64)
+    for axis in (0, 1):
+        covariance[:, axis, axis] = sigma_m**2 + torch.where(models.has_home, models.home_range, 0.0) ** 2
+        covariance[:, axis + 2, axis + 2] = models.initial_speed**2
+        if size > 4:
+            about = torch.where(models.has_home, sigma_m**2, 0.0)
+            covariance[:, axis + 4, axis + 4] = covariance[:, axis, axis + 4] = covariance[:, axis + 4, axis] = about
+    return mean, covariance
 
 
 def _update(
@@ -125,7 +135,7 @@ def backward_kernel(filtered: Filtered) -> Backward:
     gain = torch.linalg.solve(predicted, matrix @ covariance).mT
     offset = mean - (gain @ (matrix @ mean[..., None]))[..., 0]
     # Joseph's form stays positive semi-definite where covariance - gain predicted gain' would cancel.
-    keep = torch.eye(4, dtype=torch.float64) - gain @ matrix
+    keep = torch.eye(matrix.shape[-1], dtype=torch.float64) - gain @ matrix
     conditional = keep @ covariance @ keep.mT + gain @ noise @ gain.mT
     root = torch.linalg.cholesky(conditional + _jitter(conditional))
     last = filtered.covariance[:, -1]
@@ -138,7 +148,7 @@ def _jitter(covariance: Tensor) -> Tensor:
 
 
 def smooth(filtered: Filtered, backward: Backward) -> tuple[Tensor, Tensor]:
-    """Smoothed moments of every node: mean [P, M, 4] and covariance [P, M, 4, 4]."""
+    """Smoothed moments of every node: mean [P, M, S] and covariance [P, M, S, S]."""
     mean, covariance = filtered.mean[:, -1], filtered.covariance[:, -1]
     means, covariances = [mean], [covariance]
     for m in range(backward.gain.shape[1] - 1, -1, -1):
@@ -155,11 +165,11 @@ def draw(backward: Backward, rows: Tensor, normal: Tensor) -> Tensor:
 
     Args:
         backward: kernels of P rows.
-        rows: [S] the row of each sample.
-        normal: [S, M, 4] standard normal numbers.
+        rows: [N] the row of each sample.
+        normal: [N, M, S] standard normal numbers.
 
     Returns:
-        States (x, y, vx, vy) [S, M, 4].
+        States (x, y, vx, vy, where models have a home its centre) [N, M, S].
     """
     state = backward.mean[rows] + (backward.last_root[rows] @ normal[:, -1, :, None])[..., 0]
     states = [state]

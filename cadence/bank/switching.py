@@ -37,27 +37,30 @@ def continue_moments(
 
     Args:
         switching: C models.
-        durations_s: [R, S] time to pass at each step.
+        durations_s: [R, T] time to pass at each step.
         weight: [R, C] probability of each model at the last detection.
-        mean: [R, C, 4] of the state there, given the model (anything finite where the weight is zero).
-        covariance: [R, C, 4, 4] likewise.
+        mean: [R, C, S] of the state there, given the model (anything finite where the weight is zero).
+        covariance: [R, C, S, S] likewise.
 
     Returns:
-        Mean [R, S, 2] and variance an axis [R, S].
+        Mean [R, T, 2] and variance an axis [R, T].
     """
     first = weight[..., None] * mean
     second = weight[..., None, None] * (covariance + mean[..., :, None] * mean[..., None, :])
+    entry, entry_noise = _entry(switching.models)
     means, variances = [], []
-    num_rows, num_models = weight.shape
+    steps = _Steps(switching.models, durations_s)
     for s in range(durations_s.shape[1]):
         duration = durations_s[:, s]
         stay = torch.exp(-switching.rate * duration)[:, None]
-        weight = stay * weight + (1.0 - stay) * switching.weight * weight.sum(1, keepdim=True)
-        first = stay[..., None] * first + ((1.0 - stay) * switching.weight)[..., None] * first.sum(1, keepdim=True)
-        second = stay[..., None, None] * second + ((1.0 - stay) * switching.weight)[..., None, None] * second.sum(
-            1, keepdim=True
-        )
-        matrix, noise = _transitions(switching.models, duration, num_rows, num_models)
+        share = (1.0 - stay) * switching.weight
+        total = weight.sum(1, keepdim=True)
+        entering = (entry @ first.sum(1)[:, None, :, None])[..., 0]
+        entering_second = entry @ second.sum(1, keepdim=True) @ entry.mT + total[..., None, None] * entry_noise
+        weight = stay * weight + share * total
+        first = stay[..., None] * first + share[..., None] * entering
+        second = stay[..., None, None] * second + share[..., None, None] * entering_second
+        matrix, noise = steps[s]
         first = (matrix @ first[..., None])[..., 0]
         second = matrix @ second @ matrix.mT + weight[..., None, None] * noise
         total_mean = first.sum(1)[:, :2]
@@ -67,6 +70,23 @@ def continue_moments(
     return torch.stack(means, 1), torch.stack(variances, 1)
 
 
+def _entry(models: MotionModels) -> tuple[Tensor, Tensor]:
+    """What becomes of the state when a model takes over [C, S, S], and the noise of that [C, S, S].
+
+    A target that begins to stay about a place does so where it is: the centre lies about it as the stationary law says.
+    """
+    size = models.num_states
+    matrix = torch.eye(size, dtype=torch.float64).repeat(len(models), 1, 1)
+    noise = torch.zeros_like(matrix)
+    if size > 4:
+        home = models.has_home
+        for axis in (0, 1):
+            matrix[home, axis + 4, axis + 4] = 0.0
+            matrix[home, axis + 4, axis] = 1.0
+            noise[home, axis + 4, axis + 4] = models.home_range[home] ** 2
+    return matrix, noise
+
+
 def continue_samples(
     switching: SwitchingModels, durations_s: Tensor, model: Tensor, state: Tensor, uniform: Tensor, normal: Tensor
 ) -> Tensor:
@@ -74,25 +94,31 @@ def continue_samples(
 
     Args:
         switching: C models.
-        durations_s: [R, S].
+        durations_s: [R, T].
         model: [R, K] index of each hypothesis' model at the last detection.
-        state: [R, K, 4] its state there.
-        uniform: [R, K, S, 2] uniform numbers: whether the model changes, and to which.
-        normal: [R, K, S, 4] standard normal numbers.
+        state: [R, K, S] its state there.
+        uniform: [R, K, T, 2] uniform numbers: whether the model changes, and to which.
+        normal: [R, K, T, S] standard normal numbers.
 
     Returns:
-        Positions [R, K, S, 2].
+        Positions [R, K, T, 2].
     """
     cumulative = switching.weight.cumsum(0).clamp(max=1.0)
     choice = torch.searchsorted(cumulative, uniform[..., 1].contiguous()).clamp(max=len(cumulative) - 1)
-    num_rows, num_models = len(durations_s), len(switching.models)
-    rows = torch.arange(num_rows)[:, None]
+    rows = torch.arange(len(durations_s))[:, None]
+    steps = _Steps(switching.models, durations_s)
+    entry, entry_noise = _entry(switching.models)
+    entry_root = entry_noise.sqrt()
     positions = []
     for s in range(durations_s.shape[1]):
         duration = durations_s[:, s]
         changes = uniform[:, :, s, 0] > torch.exp(-switching.rate * duration)[:, None]
         model = torch.where(changes, choice[:, :, s], model)
-        matrix, noise = _transitions(switching.models, duration, num_rows, num_models)
+        if switching.models.num_states > 4:
+            # the noise of motion leaves the numbers of a constant centre unused
+            entered = entry[model] @ state[..., None] + entry_root[model] @ normal[:, :, s, :, None]
+            state = torch.where(changes[..., None], entered[..., 0], state)
+        matrix, noise = steps[s]
         scale = noise.diagonal(dim1=-2, dim2=-1)
         root = torch.linalg.cholesky(noise + torch.diag_embed(_JITTER * (scale + scale.amax(-1, keepdim=True)) + 1e-18))
         # no time, no noise: steps before the last detection must leave the state as it is
@@ -102,10 +128,27 @@ def continue_samples(
     return torch.stack(positions, 2)
 
 
-def _transitions(models: MotionModels, duration: Tensor, num_rows: int, num_models: int) -> tuple[Tensor, Tensor]:
-    """Transition and noise of every model over each row's duration [R, C, 4, 4]; computed once where all rows agree."""
-    if bool((duration == duration[0]).all()):
-        matrix, noise = transition(models, duration[:1].expand(num_models)[:, None])
-        return matrix[:, 0].expand(num_rows, -1, -1, -1), noise[:, 0].expand(num_rows, -1, -1, -1)
-    matrix, noise = transition(models, duration.expand(num_models, num_rows))
-    return matrix.transpose(0, 1), noise.transpose(0, 1)
+class _Steps:
+    """Transition and noise of every model over each row's durations: nothing, a whole step, or the rest of the first one."""
+
+    def __init__(self, models: MotionModels, durations_s: Tensor) -> None:
+        self.durations_s = durations_s
+        whole_s = durations_s.amax()
+        self.is_whole = durations_s == whole_s
+        is_part = (durations_s > 0) & ~self.is_whole
+        part_s = torch.where(is_part, durations_s, 0.0).amax(1)
+        self.whole = tuple(value[:, 0] for value in transition(models, whole_s.expand(len(models), 1)))
+        self.part = tuple(value.transpose(0, 1) for value in transition(models, part_s.expand(len(models), -1)))
+
+    def __getitem__(self, step: int) -> tuple[Tensor, Tensor]:
+        """Matrices and noise [R, C, S, S] at one step."""
+        (matrix, noise), (part_matrix, part_noise) = self.whole, self.part
+        is_whole = self.is_whole[:, step]
+        if bool(is_whole.all()):
+            return matrix.expand_as(part_matrix), noise.expand_as(part_noise)
+        is_whole, goes_on = is_whole[:, None, None, None], (self.durations_s[:, step] > 0)[:, None, None, None]
+        eye = torch.eye(matrix.shape[-1], dtype=torch.float64)
+        return (
+            torch.where(is_whole, matrix, torch.where(goes_on, part_matrix, eye)),
+            torch.where(is_whole, noise, torch.where(goes_on, part_noise, 0.0)),
+        )

@@ -10,7 +10,7 @@ import dataclasses
 import itertools
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Self
 
@@ -19,7 +19,7 @@ import torch
 from cadence.bank.bank import Bank, BankPosterior, default_step, typical_speed
 from cadence.bank.components import MotionModels, constant_velocity, ornstein_uhlenbeck
 from cadence.bank.fitting import FLOOR_STEPS, fit_constant_velocity, fit_ornstein_uhlenbeck
-from cadence.bank.hindsight import LEAST_TESTS, hindsight_scores, num_tests, withhold
+from cadence.bank.hindsight import LEAST_TESTS, Test, hindsight_scores, num_tests
 from cadence.bank.rows import track_rows
 from cadence.bank.smoother import Nodes
 from cadence.types import Detections, HypothesisSet, WindowBatch
@@ -68,9 +68,8 @@ class _SingleModel(ABC):
         wider = covariance + variance_m2 * torch.eye(2, dtype=covariance.dtype)
         return dataclasses.replace(windows, detections=dataclasses.replace(windows.detections, covariance_m2=wider))
 
-    def _tuned(self, start: Values, models: Callable[[Values], MotionModels], windows: WindowBatch, later: Detections) -> Self:
+    def _tuned(self, start: Values, models: Callable[[Values], MotionModels], tests: Sequence[Test]) -> Self:
         """The rival with the values that foresee best: those of the model from `start` on, and the noise."""
-        tests = [(windows, later), withhold(windows, seed=0)] if windows.num_windows else []
         tests = [test for test in tests if num_tests(*test) >= LEAST_TESTS]
 
         def cost(values: Values) -> float:
@@ -132,10 +131,10 @@ class ConstantVelocityKalman(_SingleModel):
         """The noise of greatest likelihood for the stretches `tracks` [B, 1, N]; `step_s` as for `Bank.fit`."""
         return dataclasses.replace(self, bank=_fitted(self.bank, tracks, step_s, fit_constant_velocity))
 
-    def tuned(self, windows: WindowBatch, later: Detections) -> Self:
-        """From `fit` on, noise of motion and detections that foresee best detections withheld from windows and `later` ones."""
+    def tuned(self, tests: Sequence[Test]) -> Self:
+        """From `fit` on, noise of motion and detections that foresee best what the windows of tests do not hold."""
         start = (float(self.bank.models.diffusion),)
-        return self._tuned(start, lambda values: constant_velocity([values[0]]), windows, later)
+        return self._tuned(start, lambda values: constant_velocity([values[0]]), tests)
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,7 +148,31 @@ class OrnsteinUhlenbeckKalman(_SingleModel):
         """Relaxation time and speed of greatest likelihood for the stretches `tracks` [B, 1, N]; `step_s` as for `Bank.fit`."""
         return dataclasses.replace(self, bank=_fitted(self.bank, tracks, step_s, fit_ornstein_uhlenbeck))
 
-    def tuned(self, windows: WindowBatch, later: Detections) -> Self:
-        """From `fit` on, memory, speed and noise that foresee best detections withheld from windows and `later` ones."""
+    def tuned(self, tests: Sequence[Test]) -> Self:
+        """From `fit` on, memory, speed and noise that foresee best what the windows of tests do not hold."""
         start = (1.0 / float(self.bank.models.relaxation_rate), float(self.bank.models.initial_speed))
-        return self._tuned(start, lambda values: ornstein_uhlenbeck([values[0]], [values[1]], [0.0]), windows, later)
+        return self._tuned(start, lambda values: ornstein_uhlenbeck([values[0]], [values[1]], [0.0]), tests)
+
+
+_WALK_MEMORY_STEPS = 0.02
+"""A velocity that is forgotten so soon is white noise to every step."""
+
+
+@dataclass(frozen=True, eq=False)
+class RandomWalkKalman(_SingleModel):
+    """A random walk: an Ornstein-Uhlenbeck velocity without memory."""
+
+    bank: Bank = dataclasses.field(default_factory=lambda: _single(_walk(5.0)))
+    name: str = "random_walk"
+
+    def fit(self, tracks: Detections, step_s: float | None = None) -> Self:
+        """The log's speed unit; its speed of spreading is found by `tuned`."""
+        return dataclasses.replace(self, bank=_fitted(self.bank, tracks, step_s, lambda *_: self.bank.models))
+
+    def tuned(self, tests: Sequence[Test]) -> Self:
+        """The speed of spreading and the noise that foresee best what the windows of tests do not hold."""
+        return self._tuned((float(self.bank.models.initial_speed),), lambda values: _walk(values[0]), tests)
+
+
+def _walk(speed: float) -> MotionModels:
+    return ornstein_uhlenbeck([_WALK_MEMORY_STEPS], [speed], [0.0])

@@ -1,69 +1,50 @@
 """The gate: how many of the hypotheses the network moves, in the past and in the future of this log.
 
-Half and half is the safe choice: the energy score of a mixture is never worse than the mean of its parts' scores. The log
-moves it to the network or to the bank alone only where detections withheld from both show clearly that this is better.
+Network and bank are pooled like the settings of the bank (`cadence.bank.pool`): by how well they foresee what was withheld from
+both, and no more of the network than that shows to help.
 """
 
 import dataclasses
-import math
 
 import torch
-from torch import Tensor
 
-from cadence.bank.hindsight import LEAST_TESTS, NUM_SAMPLES, num_tests, scores_in_hindsight, withhold
+from cadence.bank.hindsight import LEAST_TESTS, Test, distances, num_tests
+from cadence.bank.pool import NUM_DRAWN, best_weights
+from cadence.bank.rows import scatter_hypotheses
 from cadence.diffusion.general import GateScores, GeneralModel
-from cadence.types import Detections, WindowBatch
 
-_SHARES = (0.5, 1.0, 0.0)
+_SAFE = torch.tensor([1.0, 0.0], dtype=torch.float64)
+"""The bank, which drew both."""
 
 
-def gated(model: GeneralModel, windows: WindowBatch, later: Detections, seed: int = 0) -> GeneralModel:
-    """The model with the network's shares chosen by hindsight.
-
-    Clearly better means: by more than one standard error of the difference between paired scores.
+def gated(model: GeneralModel, past: Test, future: Test) -> GeneralModel:
+    """The model with the network's shares chosen by hindsight; no share where too little could be withheld.
 
     Args:
         model: with its bank fitted.
-        windows: some windows of the log.
-        later: detections after each window's origin.
-        seed: of what is withheld.
+        past: windows, and detections up to their origin that they do not hold.
+        future: windows, and detections after it.
     """
     if model.network is None:
         return model
-    untested = _Choice(_SHARES[0], None, None)
-    past = _choose(model, *withhold(windows, seed)) if windows.num_windows else untested
-    future = _choose(model, windows, later) if windows.num_windows else untested
-    scores = GateScores(past.network, past.half, future.network, future.half)
-    return dataclasses.replace(model, share_past=past.share, share_future=future.share, gate=scores)
+    chosen = [_choose(model, test) for test in (past, future)]
+    scores = GateScores(chosen[0].network, chosen[1].network)
+    return dataclasses.replace(model, share_past=chosen[0].share, share_future=chosen[1].share, gate=scores)
 
 
 @dataclasses.dataclass(frozen=True)
 class _Choice:
     share: float
     network: float | None
-    half: float | None
 
 
-def _choose(model: GeneralModel, windows: WindowBatch, unseen: Detections) -> _Choice:
-    if num_tests(windows, unseen) < LEAST_TESTS:
-        return _Choice(_SHARES[0], None, None)
-    network_m, bank_m = (model.with_shares(share).sample(windows, NUM_SAMPLES).position_m for share in (1.0, 0.0))
-    # Half and half begins with the same noise: it is the network's hypotheses where those are moved, and the bank's elsewhere.
-    is_moved = model.with_shares(0.5).moves(NUM_SAMPLES)[:, None, None, None]
-    half, network, bank = (
-        scores_in_hindsight(position_m, windows, unseen)
-        for position_m in (torch.where(is_moved, network_m, bank_m), network_m, bank_m)
-    )
-    ratios = float(network.mean() / bank.mean()), float(half.mean() / bank.mean())
-    # the larger gain over half and half, counted in standard errors
-    gains = {1.0: _gain(half, network), 0.0: _gain(half, bank)}
-    best = max(gains, key=lambda share: gains[share])
-    return _Choice(best if gains[best] > 1.0 else _SHARES[0], *ratios)
-
-
-def _gain(half: Tensor, other: Tensor) -> float:
-    """How much better `other` scores than `half`, in standard errors of the paired difference."""
-    difference = half - other
-    error = float(difference.std()) / math.sqrt(len(difference)) if len(difference) > 1 else math.inf
-    mean = float(difference.mean())
-    return mean / error if error > 0.0 else 0.0
+def _choose(model: GeneralModel, test: Test) -> _Choice:
+    windows, unseen = test
+    if not windows.num_windows or num_tests(windows, unseen) < LEAST_TESTS:
+        return _Choice(0.0, None)
+    posterior = model.bank.posterior(windows, NUM_DRAWN)
+    drawn = (posterior.sample_m, model.with_shares(1.0).denoised(posterior, windows))
+    found = distances([scatter_hypotheses(sample_m, windows).position_m for sample_m in drawn], windows, unseen)
+    error, distance = found
+    bank, network = (error - 0.5 * distance.diagonal(dim1=-2, dim2=-1)).mean(0).tolist()
+    return _Choice(float(best_weights(found, _SAFE)[1]), network / max(bank, 1e-12))

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from cadence.bank.bank import Bank, BankPosterior
+from cadence.bank.pool import BankPool
 from cadence.bank.rows import active_rows, scatter_hypotheses, with_status
 from cadence.diffusion.feasible import Feasibility, GuidanceConfig, redrawn, resampled
 from cadence.diffusion.sampler import even_angles, sample_ddim, sample_dpmpp_2m, sample_rotation
@@ -39,15 +40,10 @@ CleanHook = Callable[[Tensor, Tensor, slice], Tensor]
 
 @dataclass(frozen=True)
 class GateScores:
-    """Energy scores over the bank's, on detections withheld from both: of the network alone, and of half and half.
-
-    None where too little could be withheld.
-    """
+    """Energy scores of the network over the bank's, on detections withheld from both; None where there were too few."""
 
     past_network: float | None
-    past_half: float | None
     future_network: float | None
-    future_half: float | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +82,7 @@ class GeneralModel:
     gate       what decided the strengths, or None
     """
 
-    bank: Bank
+    bank: Bank | BankPool
     network: ResidualNetwork | None
     sampler: SamplerName = "rotation"
     num_steps: int = 6

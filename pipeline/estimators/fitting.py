@@ -1,19 +1,28 @@
 """What estimators are fitted to: the detections of one log, never its truth."""
 
+import dataclasses
 import functools
+import math
 from dataclasses import dataclass
 
+import numpy as np
 import pyarrow as pa
 import torch
+from torch import Tensor
 
 from cadence.bank.bank import Bank
-from cadence.bank.hindsight import choose_by_hindsight
+from cadence.bank.hindsight import Test, withhold
+from cadence.bank.pool import BankPool, pool_by_hindsight
 from cadence.types import Detections, WindowBatch
 from pipeline.grids import Grid
-from pipeline.windows import MissionWindows, fit_tracks, later_detections
+from pipeline.windows import MissionWindows, build_windows, fit_tracks, later_detections
 
-_HINDSIGHT_ROWS = 64
-"""So many tracks are tried: the choice among settings of a bank and the network's part in it cost what they draw."""
+_NUM_TESTS = 32
+"""So many tracks are tried of each kind: choices by hindsight cost what they draw."""
+_LEAST_GATE_TESTS = 8
+"""The network is tried on half as many tracks as are to be drawn, not fewer than these: it costs more than all else."""
+_MOST_WINDOWS = 8
+"""So many times as many windows as a log has, at most."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,15 +40,44 @@ class FittingData:
         """The data with its stretches cut."""
         return FittingData(detections, grid, windows, fit_tracks(detections, grid, default_sigma_m), default_sigma_m)
 
-    def fitted_bank(self) -> Bank:
-        """The bank fitted to the log: weights by likelihood, the choice among its settings by hindsight on later detections."""
-        bank = Bank().fit(self.tracks, self.grid.step_s)
-        return choose_by_hindsight(bank, *self.hindsight_windows)
+    def fitted_bank(self) -> BankPool:
+        """The bank fitted to the log: weights by likelihood, its settings pooled by hindsight."""
+        return self._pool
 
     @functools.cached_property
-    def hindsight_windows(self) -> tuple[WindowBatch, Detections]:
-        """What the choices by hindsight are made on: see `later_known`."""
-        return self.later_known(_HINDSIGHT_ROWS)
+    def _pool(self) -> BankPool:
+        return pool_by_hindsight(Bank().fit(self.tracks, self.grid.step_s), *self.tests)
+
+    @functools.cached_property
+    def tests(self) -> tuple[Test, Test]:
+        """What the choices by hindsight are made on: bursts withheld from windows, and what was detected after windows.
+
+        Every row is one agent's window; where the log has few windows, others between them join.
+        """
+        windows = self._many_windows()
+        grid = dataclasses.replace(self.grid, origins_ns=windows.origins_ns)
+        later = later_detections(self.detections, grid, windows, self.default_sigma_m)
+        kept, withheld = withhold(windows.batch, 0)
+        is_later = windows.batch.is_active & later.is_observed.any(-1)
+        return _rows(kept, withheld, withheld.is_observed.any(-1)), _rows(windows.batch, later, is_later)
+
+    @property
+    def gate_tests(self) -> tuple[Test, Test]:
+        """Some of the tests, evenly spread: what the network's part in the hypotheses is chosen on."""
+        num = max(_LEAST_GATE_TESTS, int(self.windows.batch.is_active.sum()) // 2)
+        past, future = (_some(*test, num) for test in self.tests)
+        return past, future
+
+    def _many_windows(self) -> MissionWindows:
+        """The windows, or so many between them that they hold enough agents to test on."""
+        num = int(self.windows.batch.is_active.sum())
+        factor = min(_MOST_WINDOWS, math.ceil(2.0 * _NUM_TESTS / max(num, 1)))
+        origins_ns = self.grid.origins_ns
+        if factor < 2 or len(origins_ns) < 2:
+            return self.windows
+        first, stride_ns = origins_ns[0], (origins_ns[1] - origins_ns[0]) // factor
+        dense = dataclasses.replace(self.grid, origins_ns=first + stride_ns * np.arange(factor * len(origins_ns)))
+        return build_windows(self.detections, dense, 0, self.default_sigma_m)
 
     def later_known(self, num_rows: int) -> tuple[WindowBatch, Detections]:
         """Evenly spread windows in which something was detected before the origin and after it, and what was after it.
@@ -52,3 +90,22 @@ class FittingData:
         num = max(1, int(num_rows / float(useful[order].double().mean()))) if len(order) else 0
         chosen = order[torch.linspace(0, len(order) - 1, min(num, len(order))).round().long()]
         return self.windows.batch[chosen], later[chosen]
+
+
+def _rows(windows: WindowBatch, unseen: Detections, is_tested: Tensor) -> Test:
+    """Evenly spread tests [B, A] as windows of one agent each, and what is unseen of it."""
+    pairs = is_tested.nonzero()
+    chosen = pairs[torch.linspace(0, len(pairs) - 1, min(_NUM_TESTS, len(pairs))).round().long()]
+    row, agent = chosen[:, 0], chosen[:, 1]
+    shown = windows.detections
+    seen, missing = (
+        Detections(*(value[row, agent][:, None] for value in (d.time_s, d.position_m, d.covariance_m2, d.is_observed)))
+        for d in (shown, unseen)
+    )
+    seeds = windows.seeds[row] + agent
+    return WindowBatch(windows.time_s, seen, seeds, windows.origin_index), missing
+
+
+def _some(windows: WindowBatch, unseen: Detections, num: int) -> Test:
+    chosen = torch.linspace(0, windows.num_windows - 1, min(num, windows.num_windows)).round().long()
+    return windows[chosen], unseen[chosen]

@@ -42,7 +42,7 @@ def load_general(weights: Path | None, samplings: Samplings) -> Loaded:
 def fitted_model(model: GeneralModel, data: FittingData, is_gated: bool = True) -> GeneralModel:
     """The model fitted to the log's detections; settings of the bank and the network's part in it chosen by hindsight."""
     fitted = dataclasses.replace(model, bank=data.fitted_bank())
-    return gated(fitted, *data.hindsight_windows) if is_gated else fitted
+    return gated(fitted, *data.gate_tests) if is_gated else fitted
 
 
 def _fitted(model: GeneralModel, samplings: Samplings, data: FittingData) -> Fitted:
@@ -73,7 +73,7 @@ def _about(model: GeneralModel) -> dict[str, Any]:
         "sampler": model.sampler,
         "num_steps": model.num_steps if model.network is not None else 0,
         "network": {"share_past": model.share_past, "share_future": model.share_future, **ratios},
-        "bank": {"speed_mps": bank.speed_mps, "switch_rate": bank.switch_rate, "num_models": len(bank.models)},
+        "bank": bank.about(),
     }
 
 

@@ -3,13 +3,13 @@
 from collections.abc import Callable, Mapping
 
 from cadence.baselines.interpolation import Hold, LinearInterpolation
-from cadence.baselines.kalman import ConstantVelocityKalman, OrnsteinUhlenbeckKalman
+from cadence.baselines.kalman import ConstantVelocityKalman, OrnsteinUhlenbeckKalman, RandomWalkKalman
 from cadence.types import Estimator
 from pipeline.estimators.fitting import FittingData
 
 
-def _tuned(rival: ConstantVelocityKalman | OrnsteinUhlenbeckKalman, data: FittingData) -> Estimator:
-    return rival.fit(data.tracks, data.grid.step_s).tuned(*data.hindsight_windows)
+def _tuned(rival: ConstantVelocityKalman | OrnsteinUhlenbeckKalman | RandomWalkKalman, data: FittingData) -> Estimator:
+    return rival.fit(data.tracks, data.grid.step_s).tuned(data.tests)
 
 
 RIVALS: Mapping[str, Callable[[FittingData], Estimator]] = {

@@ -15,6 +15,7 @@ from cadence.bank.components import (
     concatenate,
     constant_velocity,
     default_models,
+    home_ranges,
     ornstein_uhlenbeck,
     transition,
 )
@@ -24,7 +25,7 @@ turns = st.one_of(st.just(0.0), st.floats(-2.0, 2.0))
 
 
 def model_of(rate: float, turn: float, diffusion: float = 0.7, speed: float = 1.0) -> MotionModels:
-    return MotionModels(*(torch.tensor([value], dtype=torch.float64) for value in (rate, turn, diffusion, speed)))
+    return MotionModels(*(torch.tensor([value], dtype=torch.float64) for value in (rate, turn, diffusion, speed, math.inf)))
 
 
 def drift(rate: float, turn: float) -> np.ndarray:
@@ -85,7 +86,7 @@ def test_noise_is_symmetric_and_positive(rate: float, turn: float, duration: flo
 def test_no_time_changes_nothing() -> None:
     models = default_models()
     matrix, noise = transition(models, torch.zeros(len(models), 1, dtype=torch.float64))
-    assert torch.equal(matrix, torch.eye(4, dtype=torch.float64).expand_as(matrix))
+    assert torch.equal(matrix, torch.eye(6, dtype=torch.float64).expand_as(matrix))
     assert not noise.any()
 
 
@@ -134,8 +135,8 @@ def test_units_of_steps_and_metres_agree(rate: float, turn: float, step_s: float
 
 def test_the_shipped_bank_favours_no_side() -> None:
     models = default_models()
-    rows = torch.stack([models.relaxation_rate, models.turn_rate, models.diffusion, models.initial_speed], 1)
-    mirrored = rows * torch.tensor([1.0, -1.0, 1.0, 1.0], dtype=torch.float64)
+    rows = torch.stack(models.columns, 1)
+    mirrored = rows * torch.tensor([1.0, -1.0, 1.0, 1.0, 1.0], dtype=torch.float64)
     assert sorted(rows.tolist()) == sorted(mirrored.tolist())
     assert len({tuple(row) for row in rows.tolist()}) == len(models)
 
@@ -147,4 +148,39 @@ def test_models_are_selected_and_joined() -> None:
     assert picked.diffusion.tolist() == pytest.approx([0.1, 1.0, 1.0])
     assert picked.turn_rate.tolist() == [0.1, 0.0, 0.0]
     with pytest.raises(ValueError, match="one shape"):
-        MotionModels(torch.zeros(2), torch.zeros(3), torch.zeros(2), torch.zeros(2))
+        MotionModels(torch.zeros(2), torch.zeros(3), torch.zeros(2), torch.zeros(2), torch.zeros(2))
+
+
+def home_of(rate: float, speed: float, size: float) -> MotionModels:
+    return home_ranges([1.0 / rate], [speed], [size])
+
+
+@given(st.floats(0.01, 3.0), st.floats(0.1, 3.0), st.floats(0.3, 30.0), st.floats(1e-3, 30.0))
+def test_a_home_is_the_matrix_exponential_about_an_unknown_centre(rate: float, speed: float, size: float, duration: float) -> None:
+    matrix, noise = transition_of(home_of(rate, speed, size), duration)
+    pull = (speed / size) ** 2
+    a = np.kron([[0.0, 1.0, 0.0], [-pull, -rate, pull], [0.0, 0.0, 0.0]], np.eye(2))
+    block = np.zeros((12, 12))
+    block[:6, :6], block[6:, 6:] = -a, a.T
+    block[2, 8] = block[3, 9] = 2.0 * rate * speed**2
+    whole = expm(block * duration)
+    np.testing.assert_allclose(matrix.numpy(), expm(a * duration), rtol=1e-8, atol=1e-8)
+    want = torch.from_numpy(whole[6:, 6:].T @ whole[:6, 6:])
+    if duration * max(rate, speed / size) < 12.0:  # beyond, the block's own exponential loses its digits
+        assert_noise_close(noise[:4, :4], want[:4, :4], 1e-6)
+    assert not noise[4:].any() and not noise[:, 4:].any()
+
+
+@given(st.floats(0.01, 3.0), st.floats(0.1, 3.0), st.floats(0.3, 30.0), st.floats(1e-3, 300.0))
+def test_the_stationary_law_of_a_home_stays(rate: float, speed: float, size: float, duration: float) -> None:
+    matrix, noise = transition_of(home_of(rate, speed, size), duration)
+    law = torch.diag(torch.tensor([size, size, speed, speed, 0.0, 0.0], dtype=torch.float64) ** 2)
+    torch.testing.assert_close(matrix @ law @ matrix.mT + noise, law, rtol=1e-9, atol=1e-9 * size**2)
+
+
+def test_models_without_a_home_are_the_same_beside_one_with() -> None:
+    alone, duration = model_of(0.3, 0.2), torch.tensor([1.5, 1.5], dtype=torch.float64)
+    matrix, noise = transition(concatenate(alone, home_of(0.3, 1.0, 3.0)), duration)
+    want_matrix, want_noise = transition_of(alone, 1.5)
+    assert torch.equal(matrix[0, :4, :4], want_matrix) and torch.equal(noise[0, :4, :4], want_noise)
+    assert torch.equal(matrix[0, 4:], torch.eye(6, dtype=torch.float64)[4:])

@@ -1,83 +1,57 @@
-"""Choice by hindsight: what is scored, what wins, and when nothing is chosen."""
+"""What is scored by hindsight: energy scores at detections that were not shown, and the distances that they consist of."""
 
 import dataclasses
 
 import pytest
 import torch
-from fixtures.bank import as_tracks, random_windows, simulate
+from fixtures.bank import as_tracks, random_windows
 
 from cadence.bank.bank import Bank
-from cadence.bank.components import ornstein_uhlenbeck
-from cadence.bank.hindsight import candidates, choose_by_hindsight
-from cadence.types import Detections, WindowBatch
+from cadence.bank.hindsight import at_detections, distances, num_tests, scores_in_hindsight
+from cadence.metrics import energy_score
+from cadence.types import Detections
 
 WINDOWS = random_windows(num_windows=6)
 BANK = Bank().fit(as_tracks(WINDOWS.detections), 1.0)
+TIMES = torch.tensor([2.0, 5.0], dtype=torch.float64)
 
 
-def later_at(position_m: torch.Tensor, time_s: torch.Tensor) -> Detections:
-    """Detections of every agent at some times after the origin: position [B, A, N, 2]."""
-    shape = tuple(position_m.shape[:3])
-    covariance = 0.01 * torch.eye(2, dtype=torch.float64).expand(*shape, 2, 2)
-    return Detections(time_s.expand(shape), position_m, covariance, torch.ones(shape, dtype=torch.bool))
+def later(shift_m: float = 0.0) -> Detections:
+    """Two detections of every agent after the origin, by where it was seen first."""
+    position = WINDOWS.detections.position_m[:, :, :1].expand(-1, -1, 2, -1) + shift_m
+    covariance = 0.01 * torch.eye(2, dtype=torch.float64).expand(*position.shape[:3], 2, 2)
+    return Detections(TIMES.expand(position.shape[:3]), position, covariance, torch.ones(position.shape[:3], dtype=torch.bool))
 
 
-def test_candidates_differ_in_how_models_go_on() -> None:
-    often, rarely, single = candidates(BANK)
-    assert often.switch_rate > rarely.switch_rate > single.switch_rate == 0.0
-    assert single.log_weight is not None
-    assert single.log_weight.exp().tolist() == [0.0] * (len(BANK.models) - 1) + [1.0]
-    assert torch.isfinite(single.sample(WINDOWS, 2).position_m).all()
+def test_only_detections_on_the_grid_are_tests() -> None:
+    assert num_tests(WINDOWS, later()) == 24
+    assert num_tests(WINDOWS, dataclasses.replace(later(), time_s=later().time_s + 1000.0)) == 0
 
 
-def test_nothing_is_chosen_without_evidence() -> None:
-    times = torch.tensor([2.0], dtype=torch.float64)
-    here = WINDOWS.detections.position_m[:, :, :1]
-    few = later_at(here, times)
-    few = dataclasses.replace(few, is_observed=torch.arange(12).view(6, 2, 1) < 7)
-    assert choose_by_hindsight(BANK, WINDOWS, few) is BANK
-    beyond = later_at(here, times + 1000.0)
-    assert choose_by_hindsight(BANK, WINDOWS, beyond) is BANK
-    unfitted = Bank(speed_mps=1.0)
-    assert choose_by_hindsight(unfitted, WINDOWS, later_at(here, times)) is unfitted
+def test_hypotheses_are_taken_between_the_steps_around_a_detection() -> None:
+    drawn = BANK.sample(WINDOWS, 4).position_m
+    between = dataclasses.replace(later(), time_s=later().time_s + 0.25)
+    foreseen, is_used = at_detections(drawn, WINDOWS, between)
+    step = WINDOWS.origin_index + 2
+    assert is_used.all()
+    torch.testing.assert_close(foreseen[:, :, :, 0], 0.75 * drawn[:, :, :, step] + 0.25 * drawn[:, :, :, step + 1])
 
 
-def energy_score(bank: Bank, position_m: torch.Tensor, times: torch.Tensor) -> float:
-    """Energy score at grid steps from all pairs of many samples, divided by the age of the last detection."""
-    d = WINDOWS.detections
-    last = torch.where(d.is_observed, d.time_s, -torch.inf).amax(-1, keepdim=True)
-    sample = bank.sample(WINDOWS, 60).position_m[:, :, :, WINDOWS.origin_index + times.long()]
-    error = (sample - position_m[:, None]).norm(dim=-1).mean(1)
-    spread = (sample[:, :, None] - sample[:, None]).norm(dim=-1).sum((1, 2)) / (60 * 59)
-    return float(((error - 0.5 * spread) / (times - last)).mean())
+def test_scores_are_energy_scores_over_the_age_of_what_was_seen() -> None:
+    drawn, unseen = BANK.sample(WINDOWS, 400), later()
+    foreseen, _ = at_detections(drawn.position_m, WINDOWS, unseen)
+    exact = energy_score(foreseen, drawn.weight, unseen.position_m, is_fair=True)
+    seen = WINDOWS.detections
+    age_s = unseen.time_s - torch.where(seen.is_observed, seen.time_s, -torch.inf).amax(-1, keepdim=True)
+    want = (exact / age_s.clamp_min(WINDOWS.step_s)).mean(-1)[WINDOWS.is_active]
+    found = scores_in_hindsight(drawn.position_m, WINDOWS, unseen)
+    assert float(found.mean()) == pytest.approx(float(want.mean()), rel=0.05)
 
 
-@pytest.mark.parametrize("reach", [0.0, 1.0, 4.0])
-def test_the_candidate_with_the_least_energy_score_wins(reach: float) -> None:
-    times = torch.tensor([4.0, 8.0, 12.0], dtype=torch.float64)
-    forecast = candidates(BANK)[2].posterior(WINDOWS, 1).mean_m[:, WINDOWS.origin_index + times.long()]
-    noise = torch.randn(forecast.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    position = (forecast + reach * noise).view(6, 2, 3, 2)
-    scores = {candidate.switch_rate: energy_score(candidate, position, times) for candidate in candidates(BANK)}
-    chosen = choose_by_hindsight(BANK, WINDOWS, later_at(position, times)).switch_rate
-    # it scores 24 samples, half against half: the best one, or one as good within that noise
-    spread = max(scores.values()) - min(scores.values())
-    assert scores[chosen] <= min(scores.values()) + 0.25 * spread + 0.005
-
-
-def test_targets_of_one_model_choose_that_model_or_rare_changes() -> None:
-    true = ornstein_uhlenbeck([4.0], [0.8], [0.0])
-    times = torch.arange(20, dtype=torch.float64) * 2.0
-    tracks = simulate(true, times, 0.02, 40, 3)
-    past = Detections(*(getattr(tracks, f.name)[:, :, :14] for f in dataclasses.fields(Detections)))
-    later = Detections(*(getattr(tracks, f.name)[:, :, 14:] for f in dataclasses.fields(Detections)))
-    windows = WindowBatch(
-        torch.arange(-27.0, 13.0, dtype=torch.float64),
-        dataclasses.replace(past, time_s=past.time_s - 26.0),
-        torch.arange(40),
-        27,
-    )
-    bank = Bank().fit(past, 1.0)
-    after = dataclasses.replace(later, time_s=later.time_s - 26.0)
-    chosen, again = (choose_by_hindsight(bank, windows, after) for _ in range(2))
-    assert chosen.switch_rate == again.switch_rate < candidates(bank)[0].switch_rate
+def test_distances_of_a_mixture_are_those_of_its_parts() -> None:
+    unseen = later()
+    first, second = (bank.sample(WINDOWS, 8).position_m for bank in (BANK, dataclasses.replace(BANK, noise_steps=0.5)))
+    error, distance = distances([first, second], WINDOWS, unseen)
+    torch.testing.assert_close(distance, distance.mT)
+    torch.testing.assert_close(error[:, 0] - 0.5 * distance[:, 0, 0], scores_in_hindsight(first, WINDOWS, unseen))
+    assert (distance.diagonal(dim1=1, dim2=2) > 0).all()

@@ -5,7 +5,7 @@ import torch
 from fixtures.bank import Dense, dense_posterior, turn_matrix
 from torch import Tensor
 
-from cadence.bank.components import MotionModels, concatenate, constant_velocity, ornstein_uhlenbeck
+from cadence.bank.components import MotionModels, concatenate, constant_velocity, home_ranges, ornstein_uhlenbeck
 from cadence.bank.smoother import Nodes, backward_kernel, draw, filter_forward, smooth
 
 MODELS = concatenate(
@@ -36,11 +36,21 @@ def posterior(model: MotionModels, nodes: Nodes) -> Dense:
     filtered = filter_forward(model, nodes, start(1))
     backward = backward_kernel(filtered)
     mean, _ = smooth(filtered, backward)
-    m = nodes.time_s.shape[1]
-    unit = torch.eye(4 * m, dtype=torch.float64).view(4 * m, m, 4)
-    rows = torch.zeros(4 * m, dtype=torch.int64)
-    linear = (draw(backward, rows, unit) - draw(backward, rows, torch.zeros_like(unit))).view(4 * m, 4 * m)
-    return Dense(float(filtered.log_likelihood), mean[0], (linear.mT @ linear).view(m, 4, m, 4))
+    m, size = nodes.time_s.shape[1], model.num_states
+    unit = torch.eye(size * m, dtype=torch.float64).view(size * m, m, size)
+    rows = torch.zeros(size * m, dtype=torch.int64)
+    linear = (draw(backward, rows, unit) - draw(backward, rows, torch.zeros_like(unit))).view(size * m, size * m)
+    return Dense(float(filtered.log_likelihood), mean[0], (linear.mT @ linear).view(m, size, m, size))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_home_whose_centre_is_unknown_is_the_dense_gaussian(seed: int) -> None:
+    model, nodes = home_ranges([5.0], [0.7], [2.0]), random_nodes(seed)
+    got, want = posterior(model, nodes), dense_posterior(model, nodes, START_M)
+    assert got.log_likelihood == pytest.approx(want.log_likelihood, abs=1e-6)
+    torch.testing.assert_close(got.mean, want.mean, rtol=0, atol=1e-5)
+    torch.testing.assert_close(got.covariance, want.covariance, rtol=0, atol=1e-4)
+    assert float(want.covariance[-1, 4, -1, 4]) > 0.5  # the centre is not taken for known
 
 
 @pytest.mark.parametrize("index", range(len(MODELS)))

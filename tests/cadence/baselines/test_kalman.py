@@ -8,7 +8,7 @@ from fixtures.bank import as_tracks, random_windows, simulate
 
 from cadence.bank.components import constant_velocity, ornstein_uhlenbeck
 from cadence.bank.fitting import FLOOR_STEPS, log_likelihood
-from cadence.bank.hindsight import hindsight_scores
+from cadence.bank.hindsight import hindsight_scores, withhold
 from cadence.bank.rows import track_rows
 from cadence.baselines.kalman import ConstantVelocityKalman, OrnsteinUhlenbeckKalman
 from cadence.types import Detections, Estimator, WindowBatch
@@ -90,7 +90,7 @@ def steady_and_few_wild(num_steady: int = 30, num_wild: int = 3) -> tuple[Window
 def test_hindsight_finds_what_likelihood_misses(rival: ConstantVelocityKalman) -> None:
     windows, later = steady_and_few_wild()
     fitted = rival.fit(windows.detections, 1.0)
-    tuned = fitted.tuned(windows, later)
+    tuned = fitted.tuned([(windows, later), withhold(windows, 0)])
     # a few wild targets make the noise of greatest likelihood far too great for all others
     assert float(tuned.bank.models.diffusion) < 0.1 * float(fitted.bank.models.diffusion)
     by_likelihood, by_hindsight = (float(hindsight_scores(one, windows, later).mean()) for one in (fitted, tuned))
@@ -103,7 +103,7 @@ def test_too_few_detections_to_compare_change_nothing(rival: ConstantVelocityKal
     nothing = dataclasses.replace(WINDOWS.detections, is_observed=torch.zeros_like(WINDOWS.detections.is_observed))
     few = dataclasses.replace(WINDOWS, detections=dataclasses.replace(
         WINDOWS.detections, is_observed=torch.arange(7).expand(4, 2, 7) < 2))  # fmt: skip
-    assert fitted.tuned(few, nothing) is fitted
+    assert fitted.tuned([(few, nothing), withhold(few, 0)]) is fitted
 
 
 def test_noise_of_detections_adds_to_their_own() -> None:

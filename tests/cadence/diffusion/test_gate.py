@@ -1,6 +1,7 @@
-"""The gate: a bad network is switched off, a good one draws all hypotheses; and what is withheld to find out."""
+"""The gate: a bad network is switched off, a good one draws most hypotheses; and what is withheld to find out."""
 
 import dataclasses
+import itertools
 import math
 
 import pytest
@@ -41,51 +42,46 @@ def network(bias: float, head_scale: float = 0.0) -> ResidualNetwork:
     return net
 
 
+PAST = withhold(random_windows(num_windows=24, num_agents=1, num_detections=8, history=32, horizon=8), 0)
+
+
 def ratios(model: GeneralModel) -> tuple[float | None, ...]:
-    """Of network and of half and half, past before future."""
+    """Of the network, past before future."""
     assert model.gate is not None
     return dataclasses.astuple(model.gate)
 
 
 @pytest.mark.parametrize(("bias", "head_scale"), [(6.0, 0.0), (0.0, 20.0)])
 def test_a_bad_network_is_switched_off(bias: float, head_scale: float) -> None:
-    found = gated(GeneralModel(BANK, network(bias, head_scale)), WINDOWS, LATER)
+    found = gated(GeneralModel(BANK, network(bias, head_scale)), PAST, (WINDOWS, LATER))
     assert (found.share_past, found.share_future) == (0.0, 0.0)
     assert all(ratio is not None and ratio > 1.05 for ratio in ratios(found))
     assert torch.equal(found.sample(WINDOWS, 3).position_m, BANK.sample(WINDOWS, 3).position_m)
 
 
-def test_a_network_that_knows_better_draws_them_all() -> None:
+def test_a_network_that_knows_better_draws_most() -> None:
     """The targets end up two bank sigmas from where the bank expects them; the network has learned just that."""
     moved = dataclasses.replace(LATER, position_m=LATER.position_m + 2.0 * LATER_SIGMA_M[..., None])
-    found = gated(GeneralModel(BANK, network(-2.0 / (math.pi / 2))), WINDOWS, moved)
-    assert found.share_future == 1.0 and found.gate is not None
-    assert found.gate.future_network is not None and found.gate.future_half is not None
-    assert found.gate.future_network < found.gate.future_half < 1.0
+    found = gated(GeneralModel(BANK, network(-2.0 / (math.pi / 2))), PAST, (WINDOWS, moved))
+    assert found.share_future > 0.7
+    assert found.gate is not None and found.gate.future_network is not None and found.gate.future_network < 1.0
 
 
 def test_a_network_that_answers_zero_ties() -> None:
-    found = gated(GeneralModel(BANK, network(0.0)), WINDOWS, LATER)
+    found = gated(GeneralModel(BANK, network(0.0)), PAST, (WINDOWS, LATER))
     assert all(ratio == pytest.approx(1.0, abs=1e-4) for ratio in ratios(found))
     torch.testing.assert_close(found.sample(WINDOWS, 3).position_m, BANK.sample(WINDOWS, 3).position_m, atol=1e-4, rtol=1e-4)
 
 
-def test_past_and_future_are_judged_apart() -> None:
+def test_with_too_little_to_test_on_the_bank_draws_alone() -> None:
+    network_model = GeneralModel(BANK, network(6.0))
     few = dataclasses.replace(LATER, is_observed=LATER.is_observed & (torch.arange(10) < 3)[:, None, None])
-    found = gated(GeneralModel(BANK, network(6.0)), WINDOWS, few)
-    assert (found.share_past, found.share_future) == (0.0, 0.5)
-    assert [ratio is None for ratio in ratios(found)] == [False, False, True, True]
-
-
-def test_with_too_little_to_test_on_it_is_half_and_half() -> None:
-    bad = GeneralModel(BANK, network(6.0))
-    found = gated(bad, WINDOWS[:2], LATER[:2])
-    assert (found.share_past, found.share_future) == (0.5, 0.5)
-    assert ratios(found) == (None, None, None, None)
-    none = gated(bad, WINDOWS[:0], LATER[:0])
-    assert (none.share_past, none.share_future) == (0.5, 0.5)
+    found = gated(network_model, PAST, (WINDOWS, few))
+    assert [ratio is None for ratio in ratios(found)] == [False, True] and found.share_future == 0.0
+    none = gated(network_model, withhold(WINDOWS[:0], 0), (WINDOWS[:0], LATER[:0]))
+    assert (none.share_past, none.share_future) == (0.0, 0.0) and ratios(none) == (None, None)
     alone = GeneralModel(BANK, None)
-    assert gated(alone, WINDOWS, LATER) is alone
+    assert gated(alone, PAST, (WINDOWS, LATER)) is alone
 
 
 def row(detections: Detections, window: int, agent: int) -> list[tuple[float, ...]]:
@@ -96,6 +92,15 @@ def row(detections: Detections, window: int, agent: int) -> list[tuple[float, ..
     return [tuple(values) for values in torch.cat(columns, 1).tolist()]
 
 
+def split_bursts(detections: list[tuple[float, ...]], apart_s: float) -> list[list[tuple[float, ...]]]:
+    bursts = [detections[:1]]
+    for before, after in itertools.pairwise(detections):
+        if after[0] - before[0] > apart_s:
+            bursts.append([])
+        bursts[-1].append(after)
+    return bursts
+
+
 def check_withheld(windows: WindowBatch, seed: int) -> int:
     kept, burst = withhold(windows, seed)
     num_withheld = 0
@@ -104,13 +109,15 @@ def check_withheld(windows: WindowBatch, seed: int) -> int:
             whole, left, gone = (row(d, window, agent) for d in (windows.detections, kept.detections, burst))
             assert sorted(left + gone) == sorted(whole) and left == [item for item in whole if item not in gone]
             assert left[:1] == whole[:1] and left[-1:] == whole[-1:]
-            assert bool(gone) == (len(whole) > 2)
+            bursts = split_bursts(whole, 1.5 * windows.step_s)
+            assert bool(gone) == (len(bursts) > 2)
             if gone:
-                start = whole.index(gone[0])
-                assert gone == whole[start : start + len(gone)]  # one burst: neighbours, close in time
-                assert gone[-1][0] - gone[0][0] <= 3.0 * windows.step_s
-                inner = whole[1:-1]
-                assert any([i for i in inner if abs(i[0] - c[0]) <= 1.5 * windows.step_s] == gone for c in gone)
+                chosen = bursts.index(gone)
+                unlike = {
+                    index: abs(math.log((bursts[index + 1][0][0] - bursts[index - 1][-1][0]) / (16.0 * windows.step_s)))
+                    for index in range(1, len(bursts) - 1)
+                }
+                assert unlike[chosen] <= min(unlike.values()) + 1e-5  # what remains is a gap like those that are asked for
             observed = kept.detections.is_observed[window, agent]
             assert torch.equal(observed, torch.arange(len(observed)) < len(left))  # padding last
             num_withheld += len(gone)
@@ -122,5 +129,3 @@ def test_one_burst_is_withheld_and_never_an_end(seed: int) -> None:
     windows = random_windows(num_windows=8, num_agents=2, num_detections=9, seed=seed, history=16, horizon=8)
     assert check_withheld(windows, seed) > 8
     assert torch.equal(withhold(windows, seed)[1].is_observed, withhold(windows, seed)[1].is_observed)
-    many = [withhold(windows, other)[1].is_observed for other in range(6)]
-    assert any(not torch.equal(many[0], other) for other in many[1:])
