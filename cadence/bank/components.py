@@ -55,7 +55,8 @@ class MotionModels:
 
     def __getitem__(self, index: Tensor) -> "MotionModels":
         """The models at `index` [P]; repeats are allowed."""
-        return MotionModels(*(value[index] for value in self.columns), self.num_states)
+        relaxation, turn, diffusion, speed, home = (value[index] for value in self.columns)
+        return MotionModels(relaxation, turn, diffusion, speed, home, self.num_states)
 
     @property
     def columns(self) -> tuple[Tensor, ...]:
@@ -101,8 +102,8 @@ def home_ranges(relaxation: list[float], speed: list[float], size: list[float]) 
 
 def concatenate(*models: MotionModels) -> MotionModels:
     """One bank of several."""
-    columns = (torch.cat(column) for column in zip(*(model.columns for model in models), strict=True))
-    return MotionModels(*columns, max(model.num_states for model in models))
+    relaxation, turn, diffusion, speed, home = map(torch.cat, zip(*(model.columns for model in models), strict=True))
+    return MotionModels(relaxation, turn, diffusion, speed, home, max(model.num_states for model in models))
 
 
 def default_models() -> MotionModels:
@@ -153,7 +154,8 @@ def transition(models: MotionModels, duration: Tensor) -> tuple[Tensor, Tensor]:
 
 def _about_home(models: MotionModels, duration: Tensor, extra: tuple[EllipsisType | None, ...]) -> tuple[Tensor, Tensor]:
     columns = (models.relaxation_rate, models.initial_speed, models.home_range)
-    return oscillator(*(column[extra].expand(duration.shape) for column in columns), duration)
+    relaxation, speed, home = (column[extra].expand(duration.shape) for column in columns)
+    return oscillator(relaxation, speed, home, duration)
 
 
 def _put_complex(matrix: Tensor, row: int, column: int, value: Tensor) -> None:

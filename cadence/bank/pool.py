@@ -105,8 +105,8 @@ def pool_by_hindsight(bank: Bank, past: Test, future: Test) -> BankPool:
         return BankPool(members[:1], torch.ones(1).double(), torch.ones(1).double())
     # Gaps are filled whatever happens after the last detection, and there is nothing to test.
     fixed = [dataclasses.replace(member, switch_rate=0.0) for member in members]
-    found = _found(fixed, _up_to_origin(past[0]), past[1]), _found(members, *future)
-    return BankPool(members, *(best_weights(part, _SAFE) for part in found))
+    weight_past = best_weights(_found(fixed, _up_to_origin(past[0]), past[1]), _SAFE)
+    return BankPool(members, weight_past, best_weights(_found(members, *future), _SAFE))
 
 
 def _up_to_origin(windows: WindowBatch) -> WindowBatch:

@@ -13,6 +13,8 @@ from torch import Tensor
 from cadence.bank.components import MotionModels, transition
 
 _JITTER = 1e-12
+_ROUNDING = 1e-6
+"""Steps of a grid differ by this share at most."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,7 +136,7 @@ class _Steps:
     def __init__(self, models: MotionModels, durations_s: Tensor) -> None:
         self.durations_s = durations_s
         whole_s = durations_s.amax()
-        self.is_whole = durations_s == whole_s
+        self.is_whole = durations_s >= (1.0 - _ROUNDING) * whole_s
         is_part = (durations_s > 0) & ~self.is_whole
         part_s = torch.where(is_part, durations_s, 0.0).amax(1)
         self.whole = tuple(value[:, 0] for value in transition(models, whole_s.expand(len(models), 1)))

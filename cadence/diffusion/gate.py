@@ -1,7 +1,7 @@
 """The gate: how many of the hypotheses the network moves, in the past and in the future of this log.
 
 Network and bank are pooled like the settings of the bank (`cadence.bank.pool`): by how well they foresee what was withheld from
-both, and no more of the network than that shows to help.
+both, half and half where that does not tell.
 """
 
 import dataclasses
@@ -13,12 +13,12 @@ from cadence.bank.pool import NUM_DRAWN, best_weights
 from cadence.bank.rows import scatter_hypotheses
 from cadence.diffusion.general import GateScores, GeneralModel
 
-_SAFE = torch.tensor([1.0, 0.0], dtype=torch.float64)
-"""The bank, which drew both."""
+_SAFE = torch.tensor([0.5, 0.5], dtype=torch.float64)
+"""Half and half: the energy score of a mixture is never worse than the mean of its parts' scores."""
 
 
 def gated(model: GeneralModel, past: Test, future: Test) -> GeneralModel:
-    """The model with the network's shares chosen by hindsight; no share where too little could be withheld.
+    """The model with the network's shares chosen by hindsight; half where too little could be withheld.
 
     Args:
         model: with its bank fitted.
@@ -41,7 +41,7 @@ class _Choice:
 def _choose(model: GeneralModel, test: Test) -> _Choice:
     windows, unseen = test
     if not windows.num_windows or num_tests(windows, unseen) < LEAST_TESTS:
-        return _Choice(0.0, None)
+        return _Choice(float(_SAFE[1]), None)
     posterior = model.bank.posterior(windows, NUM_DRAWN)
     drawn = (posterior.sample_m, model.with_shares(1.0).denoised(posterior, windows))
     found = distances([scatter_hypotheses(sample_m, windows).position_m for sample_m in drawn], windows, unseen)

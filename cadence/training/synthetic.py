@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from cadence.bank.bank import Bank
-from cadence.bank.hindsight import candidates
+from cadence.bank.pool import BankPool, settings_of
 from cadence.bank.rows import active_rows
 from cadence.network.residual_context import MAX_DETECTIONS, ResidualContext, build_context
 from cadence.types import Detections, WindowBatch
@@ -71,7 +71,7 @@ def join_windows(parts: list[ResidualWindows]) -> ResidualWindows:
     return ResidualWindows(context, torch.cat([p.residual for p in parts]), torch.cat([p.sample for p in parts]))
 
 
-def residual_windows(bank: Bank, windows: WindowBatch, truth_m: Tensor, num_samples: int) -> ResidualWindows:
+def residual_windows(bank: Bank | BankPool, windows: WindowBatch, truth_m: Tensor, num_samples: int) -> ResidualWindows:
     """Training windows from the active agents of `windows` and the truth [B, A, T, 2] at every step."""
     rows, _ = active_rows(windows)
     posterior = bank.posterior(windows, num_samples)
@@ -110,14 +110,15 @@ def _scenario_windows(config: SyntheticConfig, rng: np.random.Generator) -> Resi
     bank = Bank().fit(fit_to, 1.0)
     if bank.log_weight is None:
         return None
-    bank = candidates(bank)[int(rng.choice(3, p=[0.5, 0.4, 0.1]))]
+    settings = settings_of(bank)
+    bank = settings[int(rng.integers(len(settings)))]
     origins = rng.integers(config.history_steps, length - config.horizon_steps, (config.num_windows, config.num_tracks))
     return _windows_at(config, bank, tracks, seen, origins, rng)
 
 
 def _windows_at(
     config: SyntheticConfig,
-    bank: Bank,
+    bank: Bank | BankPool,
     tracks: SyntheticTracks,
     seen: np.ndarray,
     origins: np.ndarray,

@@ -26,8 +26,8 @@ class InferConfig:
     paper            how a checkpoint of the paper preset is sampled; it brings its own grid
     place            how a checkpoint of the place preset is sampled; it brings its own grid. Its older name, scene, is still
                      read
-    is_gated         of the general preset: the network moves all, half or none of the hypotheses, as withheld detections of
-                     this log advise
+    is_gated         of the general preset: the network moves as many of the hypotheses as withheld detections of this log
+                     advise
     is_tested        a checkpoint that adapts to no log is tested on later detections of this one; where it does not fit,
                      hypotheses are drawn with the default checkpoint instead
     is_strict        refuse a log that the checkpoint does not fit (`--strict`)

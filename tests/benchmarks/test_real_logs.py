@@ -1,5 +1,6 @@
 """The benchmark of estimators on real logs: pooling over seeds, resuming, and its page and chart, on made-up results."""
 
+import dataclasses
 from pathlib import Path
 
 import pytest
@@ -15,11 +16,12 @@ def result(estimator: str, seed: int, energy: float, groups: tuple[str, ...] = (
     sums = {part: {metric: [energy * 10.0 * (i + 1) for i in range(len(groups))] for metric in METRICS} for part in PARTS}
     counts = {part: {metric: [10] * len(groups) for metric in METRICS} for part in PARTS}
     return Result(
-        real_logs.RESULT_VERSION, estimator, "ships", rate, seed, 50, 20.0, 30, 400, 40.0, 0.1, 1.0, list(groups), sums, counts
+        real_logs.RESULT_VERSION, estimator, "ships", "ships", rate, seed, 50, 20.0, 30, 400, 40.0, 0.1, 1.0, list(groups),
+        sums, counts,
     )  # fmt: skip
 
 
-def test_ratio_is_to_the_better_kalman_over_all_seeds() -> None:
+def test_ratio_is_to_the_best_rival_over_all_seeds() -> None:
     results = [result("cadence", seed, 1.8) for seed in (0, 1)]
     results += [result("cv", 0, 2.0), result("cv", 1, 2.2), result("ou", 0, 3.0), result("ou", 1, 1.0)]
     row = next(row for row in table(results) if row.estimator == "cadence" and row.part == "past")
@@ -32,6 +34,14 @@ def test_seeds_that_an_estimator_lacks_are_left_out() -> None:
     results = [result("cadence", 0, 1.0), result("cv", 0, 2.0), result("cv", 1, 9.0)]
     row = next(row for row in table(results) if row.estimator == "cadence")
     assert row.ratio is not None and row.ratio.value == pytest.approx(0.5)
+
+
+def test_flights_of_one_log_are_pooled_as_groups() -> None:
+    flights = [dataclasses.replace(result("cadence", 0, energy), case=case) for case, energy in (("east", 1.0), ("west", 3.0))]
+    flights += [dataclasses.replace(result("ou", 0, energy), case=case) for case, energy in (("east", 2.0), ("west", 2.0))]
+    row = next(row for row in table(flights) if row.estimator == "cadence" and row.part == "past")
+    assert row.ratio is not None and row.ratio.value == pytest.approx(1.0) and row.num_cells == 60
+    assert row.ratio.low < 1.0 < row.ratio.high
 
 
 def test_other_cells_are_refused() -> None:

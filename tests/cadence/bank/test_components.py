@@ -156,7 +156,9 @@ def home_of(rate: float, speed: float, size: float) -> MotionModels:
 
 
 @given(st.floats(0.01, 3.0), st.floats(0.1, 3.0), st.floats(0.3, 30.0), st.floats(1e-3, 30.0))
-def test_a_home_is_the_matrix_exponential_about_an_unknown_centre(rate: float, speed: float, size: float, duration: float) -> None:
+def test_a_home_is_the_matrix_exponential_about_an_unknown_centre(
+    rate: float, speed: float, size: float, duration: float
+) -> None:
     matrix, noise = transition_of(home_of(rate, speed, size), duration)
     pull = (speed / size) ** 2
     a = np.kron([[0.0, 1.0, 0.0], [-pull, -rate, pull], [0.0, 0.0, 0.0]], np.eye(2))

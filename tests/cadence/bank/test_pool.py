@@ -78,9 +78,7 @@ def test_targets_that_stay_about_a_place_are_drawn_with_a_home() -> None:
     shown = dataclasses.replace(past, time_s=past.time_s - 114.0)
     windows = WindowBatch(torch.arange(-63.0, 61.0, dtype=torch.float64), shown, torch.arange(30), 63)
     bank = Bank().fit(past, 1.0)
-    pool = pool_by_hindsight(
-        bank, withhold(windows, 0), (windows, dataclasses.replace(later, time_s=later.time_s - 114.0))
-    )
+    pool = pool_by_hindsight(bank, withhold(windows, 0), (windows, dataclasses.replace(later, time_s=later.time_s - 114.0)))
     share = dict(zip(SETTINGS, pool.weight_future.tolist(), strict=True))
     assert bank.log_weight is not None
     assert float(bank.log_weight.exp()[bank.models.has_home].sum()) > 0.5 or share["home"] > 0.3

@@ -54,9 +54,8 @@ def ratios(model: GeneralModel) -> tuple[float | None, ...]:
 @pytest.mark.parametrize(("bias", "head_scale"), [(6.0, 0.0), (0.0, 20.0)])
 def test_a_bad_network_is_switched_off(bias: float, head_scale: float) -> None:
     found = gated(GeneralModel(BANK, network(bias, head_scale)), PAST, (WINDOWS, LATER))
-    assert (found.share_past, found.share_future) == (0.0, 0.0)
+    assert max(found.share_past, found.share_future) < 0.1
     assert all(ratio is not None and ratio > 1.05 for ratio in ratios(found))
-    assert torch.equal(found.sample(WINDOWS, 3).position_m, BANK.sample(WINDOWS, 3).position_m)
 
 
 def test_a_network_that_knows_better_draws_most() -> None:
@@ -73,13 +72,13 @@ def test_a_network_that_answers_zero_ties() -> None:
     torch.testing.assert_close(found.sample(WINDOWS, 3).position_m, BANK.sample(WINDOWS, 3).position_m, atol=1e-4, rtol=1e-4)
 
 
-def test_with_too_little_to_test_on_the_bank_draws_alone() -> None:
+def test_with_too_little_to_test_on_it_is_half_and_half() -> None:
     network_model = GeneralModel(BANK, network(6.0))
     few = dataclasses.replace(LATER, is_observed=LATER.is_observed & (torch.arange(10) < 3)[:, None, None])
     found = gated(network_model, PAST, (WINDOWS, few))
-    assert [ratio is None for ratio in ratios(found)] == [False, True] and found.share_future == 0.0
+    assert [ratio is None for ratio in ratios(found)] == [False, True] and found.share_future == 0.5
     none = gated(network_model, withhold(WINDOWS[:0], 0), (WINDOWS[:0], LATER[:0]))
-    assert (none.share_past, none.share_future) == (0.0, 0.0) and ratios(none) == (None, None)
+    assert (none.share_past, none.share_future) == (0.5, 0.5) and ratios(none) == (None, None)
     alone = GeneralModel(BANK, None)
     assert gated(alone, PAST, (WINDOWS, LATER)) is alone
 
