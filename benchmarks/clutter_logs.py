@@ -1,4 +1,4 @@
-"""Streams of detections without identity, with clutter, for `clutter.py`: every 20 s a radar sees some of four targets.
+"""Streams of detections without identity, with clutter: every 20 s a radar sees some of four targets.
 
 Targets cross, go side by side, or appear and leave; clutter lies evenly over the area.
 """

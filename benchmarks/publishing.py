@@ -33,6 +33,7 @@ PAGES = {
     "sampling": ("sampler_speed", "place_samplers", "place_guidance", "inpainting_jumps", "inpainting_closed_form"),
     "several_targets": ("rendezvous", "attention_cost"),
     "association": ("association",),
+    "not_stated": ("measurement_noise",),
     "logs": ("log_reading", "plausibility", "log_writing"),
     "runs": ("batch", "batch_engines", "memory", "many_agents"),
     "rivals": (),
