@@ -184,14 +184,16 @@ def score_mission(directory: Path, config: EvaluateConfig, progress: Progress) -
         true_motion=truth.laws(),
         gospa_cutoff_m=case.cutoff_m if case.is_joint else None,
         is_matched=case.is_matched,
-        true_collision_share=None if collides is None else _collision_share(collides, case.truth_m, case.is_known),
+        true_collision_share=_collision_share(collision_test(directory, windows, are_ways_straight=False), case),
     )
 
 
-def _collision_share(collides: IsInside, truth_m: Tensor, is_known: Tensor) -> float:
-    """Share of the known steps of the truth [B, A, T, 2] that touch an obstacle."""
-    hit = collides(truth_m[:, None], torch.arange(len(truth_m)))[:, 0]
-    return float(hit[is_known].double().mean()) if bool(is_known.any()) else 0.0
+def _collision_share(collides: IsInside | None, case: Case) -> float | None:
+    """Share of the known steps of the truth that lie in an obstacle; None without obstacles."""
+    if collides is None:
+        return None
+    hit = collides(case.truth_m[:, None], torch.arange(len(case.truth_m)))[:, 0]
+    return float(hit[case.is_known].double().mean()) if bool(case.is_known.any()) else 0.0
 
 
 def _fitting(case: Case, seed: int) -> FittingData:

@@ -49,7 +49,7 @@ class ScoredMission:
 
     cells         by estimator, OWN_NAME first; all in the same order
     num_unscored  (window, agent) pairs with truth and detections but without hypotheses: these are spared
-    true_collision_share  of the steps of the truth, those that touch an obstacle; None without obstacles
+    true_collision_share  of the steps of the truth, those that lie in an obstacle; None without obstacles
     motion, true_motion  how hypotheses move, by estimator, and how the truth does
     joint         by estimator, scores of all agents together; empty for one agent
     is_matched    detections are of unknown origin: agents were matched to those of the truth
@@ -206,7 +206,7 @@ def _entered(logs: Sequence[ScoredLog]) -> Iterator[str]:
     share, log_id = max(shares, default=(0.0, ""))
     if share > 0.0:
         yield (
-            f"Obstacles: {max(100 * share, 0.1):.3g} % of the true steps of {log_id} touch one, and hypotheses keep out "
+            f"Obstacles: {max(100 * share, 0.1):.3g} % of the true steps of {log_id} lie in one, and hypotheses keep out "
             'of them; check where they lie, or set infer.guidance.mode = "none".'
         )
 

@@ -165,8 +165,11 @@ def _stored_grid(stored: MissionHypotheses, directory: Path, context_steps: int 
     )  # fmt: skip
 
 
-def collision_test(directory: Path, windows: MissionWindows) -> IsInside | None:
-    """Which states touch an obstacle, themselves or on the straight way from the step before; None without obstacles."""
+def collision_test(directory: Path, windows: MissionWindows, are_ways_straight: bool = True) -> IsInside | None:
+    """Which states touch an obstacle, themselves or on the straight way from the step before; None without obstacles.
+
+    `are_ways_straight`: false of the truth, of which the way between two steps is not known.
+    """
     path = directory / OBSTACLES_NAME
     obstacles = read_obstacles(path) if path.is_file() else None
     if obstacles is None or obstacles.count == 0:
@@ -175,7 +178,8 @@ def collision_test(directory: Path, windows: MissionWindows) -> IsInside | None:
     def collides(position_m: Tensor, index: Tensor) -> Tensor:
         offset_m = torch.from_numpy(windows.datum_m[index.numpy()])[:, None, None, None]
         hit = states_in_collision(position_m, obstacles, offset_m=offset_m)
-        hit[..., 1:] |= segments_in_collision(position_m, obstacles, offset_m=offset_m)
+        if are_ways_straight:
+            hit[..., 1:] |= segments_in_collision(position_m, obstacles, offset_m=offset_m)
         return hit
 
     return collides

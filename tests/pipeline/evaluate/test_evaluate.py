@@ -188,8 +188,8 @@ def test_truth_that_enters_an_obstacle_is_told(tmp_path: Path) -> None:
         return [words for words in evaluate(mission, config, QUIET).summary["verdict"] if words.startswith("Obstacles:")]
 
     assert line(1e5) == [
-        "Obstacles: 100 % of the true steps of patrol touch one, and hypotheses keep out of them; check where they lie, or set "
-        'infer.guidance.mode = "none".'
+        "Obstacles: 100 % of the true steps of patrol lie in one, and hypotheses keep out of them; check where they lie, or "
+        'set infer.guidance.mode = "none".'
     ]
     assert re.match(r"Obstacles: \d{1,2}(\.\d+)? % of", line(300.0)[0])
     assert line(40.0, 1e7) == []
