@@ -22,9 +22,10 @@ from torch import Tensor
 
 from benchmarks import publishing
 from benchmarks.publishing import Measurement
+from benchmarks.real_logs_page import OWN, SHOWN, Row, draw_chart, section
 from cadence.baselines.kalman import RandomWalkKalman
 from cadence.errors import CadenceError
-from cadence.metrics import Interval, bootstrap_ratio
+from cadence.metrics import bootstrap_ratio
 from cadence.types import Estimator
 from pipeline.checkpoints import DEFAULT
 from pipeline.estimators.fitting import FittingData
@@ -50,7 +51,6 @@ RATES = (0.05, 0.12, 0.30)
 REFERENCES = ("cv", "ou", "walk", "linear", "hold")
 """The best of these in a cell, once all are known, is what others are compared with there."""
 LOGS = ("flight", "ships", "aircraft", "adsb")
-SHOWN = ("past", "between", "future")
 RESULT_VERSION = 2
 
 
@@ -108,7 +108,6 @@ LOG_RIVALS: Mapping[str, Callable[[FittingData], Estimator]] = {
     "walk": lambda data: RandomWalkKalman().fit(data.tracks, data.grid.step_s).tuned(data.tests),
 }
 """The rivals of `cadence evaluate`, and a random walk, tuned like the Kalman smoothers."""
-OWN = "cadence"
 UNGATED = "network"
 """Cadence without its gate: the network takes part whatever hindsight says of it."""
 ESTIMATORS = (OWN, UNGATED, *LOG_RIVALS)
@@ -226,20 +225,6 @@ def prepare(setting: Setting, directory: Path, progress: Progress) -> None:
     progress.note(f"{setting.folder}: thinned, bursts of {case.mean_burst_s:g} s, gaps of {gap_s:.4g} s")
 
 
-@dataclass(frozen=True)
-class Row:
-    """One estimator on one log at one rate, over all seeds. `ratio` is to the best of `REFERENCES` by energy score."""
-
-    log: str
-    rate: float
-    part: str
-    estimator: str
-    means: dict[str, Interval]
-    num_cells: int
-    ratio: Interval | None
-    better: str | None
-
-
 def table(results: Sequence[Result]) -> list[Row]:
     """Rows over all seeds of a log and rate; only seeds that every estimator has done are used."""
     rows = []
@@ -319,63 +304,6 @@ def _windows(results: Sequence[Result]) -> list[publishing.Row]:
             "num_windows_greatest": max(windows), "seeds": " ".join(map(str, sorted(set.intersection(*per_estimator)))),
         })  # fmt: skip
     return rows
-
-
-def section(measured: Measurement) -> str:
-    """Ratios between detections and beyond the last one, and coverage."""
-    own = measured.rows(estimator=OWN)
-    is_ahead = [row["ratio_high"] < 1.0 for row in own]
-    heads = ["log, detections", "between: CADENCE", "bank", "straight line", "future: CADENCE", "bank", "hold still", "in 90 %"]
-    lines = []
-    for log, percent in dict.fromkeys((row["log"], row["detections_percent"]) for row in own):
-        found = {(r["part"], r["estimator"]): r for r in measured.rows(log=log, detections_percent=percent)}
-        cells = []
-        for part, simple in (("between", "linear"), ("future", "hold")):
-            cells.append(publishing.interval(found[part, OWN], "ratio", ".2f"))
-            cells += [f"{found[part, name]['ratio']:.2f}" for name in ("bank", simple)]
-        shares = [f"{100 * found[part, OWN]['coverage_90']:.0f}" for part in ("between", "future")]
-        lines.append([f"{log}, {percent} %", *cells, f"{', '.join(shares)} %"])
-    text = (
-        "Energy score over that of the best rival of the cell; CADENCE's interval lies below 1 in "
-        f"{sum(is_ahead)} of {len(own)} cells (log, share of detections, part)."
-    )
-    return f"{text}\n\n{publishing.table(heads, lines)}"
-
-
-def draw_chart(rows: Sequence[Row], path: Path) -> None:
-    """Ratios to the best rival: a panel a log and part, a group a rate, a mark an estimator."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    logs, names = list(dict.fromkeys(r.log for r in rows)), list(dict.fromkeys(r.estimator for r in rows))
-    figure, axes = plt.subplots(len(logs), len(SHOWN), figsize=(12, 2.8 * len(logs)), squeeze=False, layout="constrained")
-    for axis_row, log in zip(axes, logs, strict=True):
-        for axis, part in zip(axis_row, SHOWN, strict=True):
-            here = [row for row in rows if row.log == log and row.part == part and row.ratio is not None]
-            rates = list(dict.fromkeys(row.rate for row in here))
-            for index, name in enumerate(names):
-                ratios = [(rates.index(row.rate), row.ratio) for row in here if row.estimator == name and row.ratio]
-                x = [place + 0.8 * ((index + 0.5) / len(names) - 0.5) for place, _ in ratios]
-                y = np.array([ratio.value for _, ratio in ratios])
-                reach = np.array([[ratio.value - ratio.low, ratio.high - ratio.value] for _, ratio in ratios]).T.reshape(2, -1)
-                axis.errorbar(x, y, np.maximum(reach, 0.0), fmt="o", color=f"C{index}", label=name, capsize=2)
-            axis.axhline(1.0, color="0.6", linewidth=1)
-            axis.set_yscale("log")
-            axis.set_ylim(0.25, 4.0)
-            ticks = [0.3, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0]
-            axis.set_yticks(ticks, [f"{tick:g}" for tick in ticks])
-            axis.minorticks_off()
-            axis.set_xticks(range(len(rates)), [f"{100 * rate:.0f} %" for rate in rates])
-            axis.set_title(f"{log}, {part}", fontsize=10)
-    handles, labels = axes[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=len(names), fontsize=9)
-    figure.suptitle(
-        "Energy score over that of the best rival of the cell (below 1 is better; beyond 4 is not shown)", fontsize=11
-    )
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
 
 
 def _spread(is_active: Tensor, most_tracks: int) -> Tensor:

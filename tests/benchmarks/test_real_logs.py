@@ -59,8 +59,8 @@ def test_tables_section_and_chart(tmp_path: Path) -> None:
     (windows,) = found.rows("windows", detections_percent=5)
     assert (windows["step_s"], windows["num_windows_least"], windows["seeds"]) == (20.0, 30, "0")
     text = section(found)
-    assert "below 1 in 6 of 6 cells" in text
-    assert "| ships, 30 % | 0.50 [0.50, 0.50] | 0.75 | 1.50 | 0.50 [0.50, 0.50] | 0.75 | 2.00 | 200, 200 % |" in text
+    assert "Of 4 cells" in text and "ahead in 4 with its whole interval, behind in 0." in text
+    assert "| ships, 30 % | 0.50 [0.50, 0.50] | 0.75 | cv | 0.50 [0.50, 0.50] | 0.75 | cv | 200, 200 % |" in text
     draw_chart(rows, tmp_path / "chart.png")
     assert (tmp_path / "chart.png").stat().st_size > 5000
 
