@@ -23,7 +23,7 @@ from pipeline.estimators.presets import load_estimator
 from pipeline.estimators.samplings import GeneralSampling, Samplings
 from pipeline.files import hash_file
 from pipeline.grids import GridConfig, plan_grid
-from pipeline.infer import draws
+from pipeline.infer import draws, stage
 from pipeline.infer.config import InferConfig
 from pipeline.infer.draws import draw_windows
 from pipeline.infer.stage import infer
@@ -246,7 +246,7 @@ def test_a_detection_inside_an_obstacle_is_infeasible_and_says_so(tmp_path: Path
     # around the detections at 60 and 62 s
     circle = {"kind": "circle", "x_m": 183.0, "y_m": 40.0 * np.sin(1.22), "radius_m": 8.0}
     directory = mission(tmp_path, table, (circle,))
-    run(directory)
+    run(directory, guidance=GuidanceConfig(max_speed_mps=500.0))  # which is not the reason
     windows, _ = read_table(directory / "windows.parquet", "windows")
     rows = {row["window"]: row for row in windows.to_pylist()}
     assert rows[1]["status"] == "infeasible" and "infer.guidance (margin_m" in rows[1]["advice"]
@@ -266,6 +266,15 @@ def test_detections_that_need_more_than_the_stated_speed_say_how_much(tmp_path: 
     run(directory, guidance=GuidanceConfig(max_speed_mps=500.0))
     windows, _ = read_table(directory / "windows.parquet", "windows")
     assert "infeasible" not in windows["status"].to_pylist()
+
+
+def test_what_takes_long_says_how_long(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(stage, "_FIRST_S", -1.0)
+    monkeypatch.setattr(stage, "_LONG_S", -1.0)
+    infer(mission(tmp_path), CONFIG, Progress(), num_threads=1)
+    assert "infer: 5 windows, about 0 min by the first ones" in capsys.readouterr().err
 
 
 def test_samples_that_are_not_finite_are_replaced(tmp_path: Path) -> None:
