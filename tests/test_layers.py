@@ -27,7 +27,7 @@ FLOORS = {
     "cadence": (
         {"arrays", "errors", "schedule"},
         {"constraints", "measurement", "metrics", "resampling", "seeds"},
-        {"association", "types"},
+        {"association", "stories", "types"},
         {"bank", "recordings"},
         {"network", "worlds"},
         {"diffusion"},
