@@ -29,9 +29,13 @@ class Frame:
 
 def write_table(table: pa.Table, path: Path, name: str, frame: Frame) -> None:
     """Write `table` (its schema must be that of `name` in `schemas.tables`) with version and frame in its metadata."""
+    pq.write_table(table.replace_schema_metadata(table_metadata(name, frame)), path, compression="zstd")
+
+
+def table_metadata(name: str, frame: Frame) -> dict[str, str]:
+    """What the metadata of a table's schema say of it: its name, the version and the frame."""
     frame_json = {"frame_id": frame.frame_id, "latitude_deg": frame.latitude_deg, "longitude_deg": frame.longitude_deg}
-    metadata = {"cadence.table": name, "cadence.version": str(VERSION), "cadence.frame": json.dumps(frame_json)}
-    pq.write_table(table.replace_schema_metadata(metadata), path, compression="zstd")
+    return {"cadence.table": name, "cadence.version": str(VERSION), "cadence.frame": json.dumps(frame_json)}
 
 
 def read_table(path: Path, name: str) -> tuple[pa.Table, Frame]:

@@ -96,6 +96,30 @@ The last window has a row for every detection so far, also for those before its 
 """
 
 
+MISSION = pa.schema(
+    [
+        pa.field("log_id", pa.string(), nullable=False),
+        pa.field("block", pa.int32(), nullable=False),
+        pa.field("agent_id", pa.string(), nullable=False),
+        pa.field("hypothesis", pa.int32(), nullable=False),  # the same number is the same story in every block
+        pa.field("weight", pa.float64(), nullable=False),
+        pa.field("start_ns", pa.int64(), nullable=False),  # of the block's first step
+        pa.field("step_ns", pa.int64(), nullable=False),
+        pa.field("datum_x_m", pa.float64(), nullable=False),
+        pa.field("datum_y_m", pa.float64(), nullable=False),
+        pa.field("position_m", pa.list_(pa.list_(pa.float32(), 2)), nullable=False),
+        pa.field("height_m", pa.list_(pa.float32())),  # null: nothing is known of it
+    ]
+)
+"""One row per block of time, agent and mission hypothesis, in this order.
+
+Step i of a block lies at start_ns + i * step_ns; blocks follow each other in time, each with a step of its own, as nobody needs
+many steps where nothing is seen for long. position_m is relative to (datum_x_m, datum_y_m) in the mission frame; NaN where the
+agent is not part of the hypothesis (yet, any more). An agent has rows in the blocks in which it is part of any hypothesis, and
+then of all. Between two steps, also from one block to the next, a track is the straight line between its positions.
+"""
+
+
 def hypotheses_schema(num_steps: int) -> pa.Schema:
     """HYPOTHESES: one row per window, hypothesis and agent (only agents with status ok or infeasible).
 

@@ -54,7 +54,7 @@ FLOORS = {
         {"files"},
         {"manifest", "tables"},
         {"frames", "stores", "logs", "mapping", "tracks"},
-        {"missions", "checkpoints", "grids", "results"},
+        {"missions", "checkpoints", "grids", "results", "stories"},
         {"windows"},
         {"catalogue", "associations"},
         {"estimators", "scoring"},
