@@ -28,7 +28,7 @@ FLOORS = {
         {"arrays", "errors", "schedule"},
         {"constraints", "measurement", "metrics", "resampling", "seeds"},
         {"association", "stories", "types"},
-        {"bank", "recordings"},
+        {"answers", "bank", "recordings"},
         {"network", "worlds"},
         {"diffusion"},
         {"baselines"},
