@@ -35,7 +35,7 @@ FLOORS = {
         {"training"},
     ),
     "pipeline": (
-        {"documents", "out_of_memory", "suggestions"},
+        {"clock", "documents", "lengths", "moments", "out_of_memory", "suggestions"},
         {
             "accuracies",
             "arrays",

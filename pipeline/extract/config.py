@@ -5,9 +5,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from pipeline.extract.obstacle_sources import ObstacleSources
-from pipeline.extract.stamps import moment_ns
 from pipeline.extract.thinning import ThinningConfig
 from pipeline.mapping.sources import SourceConfig
+from pipeline.moments import moment_ns
 from pipeline.suspicions import LogKind
 
 

@@ -22,13 +22,13 @@ from pipeline.extract.obstacle_sources import collect_obstacles
 from pipeline.extract.positions import Positions
 from pipeline.extract.reading import read_positions
 from pipeline.extract.selection import select_readers, selected_channels, unused_channels
-from pipeline.extract.stamps import moment_ns
 from pipeline.extract.summary import summarise, tell
 from pipeline.extract.tables import detection_table, track_table
 from pipeline.extract.transform_messages import LogTransforms
 from pipeline.logs.reader import MissionLog
 from pipeline.manifest import StageResult, run_stage
 from pipeline.missions import CATALOGUE_NAME
+from pipeline.moments import moment_ns
 from pipeline.obstacle_file import OBSTACLES_NAME, write_obstacles
 from pipeline.progress import Progress
 from pipeline.suspicions import Suspicions, few

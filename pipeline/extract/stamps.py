@@ -1,15 +1,12 @@
 """Time stamps as messages state them → int64 nanoseconds."""
 
 import math
-import re
-from datetime import UTC, datetime
 from typing import Any
+
+from pipeline.moments import LIMIT_NS, is_iso, iso_ns
 
 _SECONDS = ("sec", "secs", "seconds")
 _NANOSECONDS = ("nanosec", "nsec", "nsecs", "nanos")
-_ISO = re.compile(r"(\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d)(?:\.(\d{1,9})\d*)?(?: ?(Z|UTC|[+-]\d\d:?\d\d)(?: UTC)?)?")
-"""ISO 8601, and as Go writes times: `2023-11-14 22:13:20.123456789 +0000 UTC`."""
-_LIMIT_NS = 2**63
 
 
 def stamp_ns(value: Any) -> int | None:
@@ -24,19 +21,7 @@ def stamp_ns(value: Any) -> int | None:
         found = _number_ns(value)
     else:
         found = _pair_ns(value)
-    return None if found is None or found == 0 or abs(found) >= _LIMIT_NS else found
-
-
-def moment_ns(value: float | str, start_ns: int) -> int | None:
-    """The moment that a user states: seconds after `start_ns` (also as text), or ISO 8601; None where it is neither."""
-    if isinstance(value, str):
-        if _ISO.fullmatch(value.strip()):
-            return stamp_ns(value)
-        try:
-            value = float(value)
-        except ValueError:
-            return None
-    return start_ns + round(value * 1e9) if math.isfinite(value) else None
+    return None if found is None or found == 0 or abs(found) >= LIMIT_NS else found
 
 
 def _pair_ns(value: Any) -> int | None:
@@ -58,14 +43,8 @@ def _first(value: Any, names: tuple[str, ...]) -> Any:
 
 
 def _text_ns(text: str) -> int | None:
-    match = _ISO.fullmatch(text)
-    if match is not None:
-        try:
-            moment = datetime.fromisoformat(match[1].replace(" ", "T") + (match[3] or "Z").replace("UTC", "Z"))
-        except ValueError:
-            return None
-        whole = moment - datetime(1970, 1, 1, tzinfo=UTC)
-        return (whole.days * 86400 + whole.seconds) * 10**9 + int((match[2] or "0").ljust(9, "0"))
+    if is_iso(text):
+        return iso_ns(text)
     try:
         return _number_ns(int(text))
     except ValueError:

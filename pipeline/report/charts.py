@@ -8,9 +8,9 @@ from html import escape
 import numpy as np
 
 from cadence.arrays import Float64s, Int64s
+from pipeline.clock import Clock
+from pipeline.lengths import metres
 from pipeline.report.analysis import Analysis
-from pipeline.report.clock import Clock
-from pipeline.report.lengths import metres
 from pipeline.report.mission import Mission, WindowRow
 
 CHART_WIDTH, LABEL_WIDTH, MARGIN_RIGHT = 1200, 150, 14

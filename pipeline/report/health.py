@@ -4,8 +4,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from pipeline.accuracies import in_words
+from pipeline.clock import Clock, duration
 from pipeline.logs.reader import Health
-from pipeline.report.clock import Clock, duration
 from pipeline.report.markup import flatten, label, pairs, section, table, text
 from pipeline.report.mission import Mission
 

@@ -10,7 +10,7 @@ from html import escape
 import numpy as np
 
 from cadence.arrays import Float64s
-from pipeline.report.lengths import metres, nice_length
+from pipeline.lengths import metres, nice_length
 from pipeline.report.mission import Fan, Mission, Obstacle, Points
 from pipeline.report.modes import Strand
 

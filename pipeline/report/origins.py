@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 import pyarrow as pa
 
+from pipeline.clock import Clock
 from pipeline.presence import presence_words
-from pipeline.report.clock import Clock
 from pipeline.report.markup import section, table, text
 
 SURE = 0.9

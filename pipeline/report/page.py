@@ -7,8 +7,8 @@ from html import escape
 from importlib import resources
 from string import Template
 
+from pipeline.clock import Clock, duration
 from pipeline.report.analysis import Analysis, Moment, share_of_steps
-from pipeline.report.clock import Clock, duration
 from pipeline.report.health import health_section
 from pipeline.report.markup import inline_json, legend, pairs, section, text
 from pipeline.report.mission import Mission

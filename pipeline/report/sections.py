@@ -5,10 +5,10 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from pipeline.clock import Clock, duration
+from pipeline.lengths import metres
 from pipeline.report.analysis import Analysis, Moment, Trouble, find_troubles, shown_share, shown_steps
 from pipeline.report.charts import SpreadAxis, TimeAxis, uncertainty_chart
-from pipeline.report.clock import Clock, duration
-from pipeline.report.lengths import metres
 from pipeline.report.maps import moment_map
 from pipeline.report.markup import label, legend, section, table, text
 from pipeline.report.mission import Fan, Mission, WindowRow

@@ -3,8 +3,8 @@
 from collections.abc import Mapping
 from typing import Any
 
+from pipeline.lengths import metres
 from pipeline.report.analysis import Analysis
-from pipeline.report.lengths import metres
 from pipeline.report.markup import label, table, text
 from pipeline.report.markup import section as card
 from pipeline.report.mission import Mission

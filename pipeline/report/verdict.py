@@ -5,9 +5,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from pipeline.clock import duration
+from pipeline.lengths import metres, speed
 from pipeline.report.analysis import Analysis, Speeds
-from pipeline.report.clock import duration
-from pipeline.report.lengths import metres, speed
 from pipeline.report.markup import section, text
 from pipeline.report.mission import Mission
 from pipeline.report.scored import PARTS, Scored

@@ -10,14 +10,14 @@ from fixtures.mission import build_mission
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pipeline.clock import Clock, duration
 from pipeline.config import read_config
 from pipeline.frames import to_geodetic
+from pipeline.lengths import metres, nice_length
 from pipeline.report.analysis import analyse, choose_moments, find_troubles
 from pipeline.report.charts import SpreadAxis
-from pipeline.report.clock import Clock, duration
 from pipeline.report.fans import Detail, choose_detail, choose_vertices, encode_fan
 from pipeline.report.geodesy import EXPONENTS, fit_geodesy
-from pipeline.report.lengths import metres, nice_length
 from pipeline.report.maps import moment_map
 from pipeline.report.markup import as_toml, inline_json, text
 from pipeline.report.mission import Fan, Points, load_mission
