@@ -112,9 +112,9 @@ def default_path(case: Case, sampler: str = "rotation", num_steps: int = 6) -> H
     """What `infer` does with these windows once its model is fitted: bank, sampler with guidance, repair and weights."""
     model = dataclasses.replace(case.model, sampler=sampler, num_steps=num_steps)
     windows = case.windows.located(int(case.windows.origins_ns[0]), case.obstacles)
-    parts = [piece() for piece in draw_windows(model, windows, case.num_hypotheses, is_apart=True)]
-    position, weight = torch.cat([part[1] for part in parts]), torch.cat([part[2] for part in parts])
-    return HypothesisSet(position, weight, tuple(tuple(row) for part in parts for row in part[3]))
+    parts = [piece()[1] for piece in draw_windows(model, windows, case.num_hypotheses, is_apart=True)]
+    position, weight = torch.cat([part.position_m for part in parts]), torch.cat([part.weight for part in parts])
+    return HypothesisSet(position, weight, tuple(row for part in parts for row in part.status))
 
 
 def unconstrained_path(case: Case) -> HypothesisSet:

@@ -8,11 +8,12 @@ from .diffusion.general import GeneralModel
 from .diffusion.place import PlaceModel
 from .diffusion.sampler import sample_ddim, sample_ddpm, sample_dpmpp_2m, sample_rotation
 from .errors import CadenceError
+from .evidence.estimator import WithEvidence
 from .metrics import ade, coverage, energy_score, mean_error, min_ade
 from .recordings import Recordings, cut_windows
 from .training.loop import OptimiserConfig
 from .training.place import place_config, train_place
-from .types import Context, Detections, Estimator, HypothesisSet, WindowBatch
+from .types import Context, Detections, Estimator, Evidence, HypothesisSet, Tracks, WindowBatch
 
 __all__ = [
     "AbsoluteModel",
@@ -22,6 +23,7 @@ __all__ = [
     "Context",
     "Detections",
     "Estimator",
+    "Evidence",
     "GeneralModel",
     "GuidanceConfig",
     "HypothesisSet",
@@ -30,8 +32,10 @@ __all__ = [
     "OrnsteinUhlenbeckKalman",
     "PlaceModel",
     "Recordings",
+    "Tracks",
     "TrajectoryLibrary",
     "WindowBatch",
+    "WithEvidence",
     "ade",
     "coverage",
     "cut_windows",

@@ -5,7 +5,7 @@ relative to the window origin, positions float metres relative to the window dat
 """
 
 from dataclasses import dataclass, field, replace
-from typing import Protocol, Self
+from typing import Any, Protocol, Self
 
 import torch
 from torch import Tensor
@@ -51,6 +51,63 @@ class Detections:
 
 
 @dataclass(frozen=True, eq=False)
+class Tracks:
+    """Whole tracks of B windows in the mission's frame and time, as evidence sees them.
+
+    position_m [B, K, A, T, 2] float64 metres in the mission frame; NaN where an agent is no part of a hypothesis
+    time_s     [B, T] float64 increasing seconds from the beginning of the mission
+    agent_ids  names of the agents [A]; none where windows do not know any
+    height_m   [B, K, A, T] float64 metres up, NaN where nothing is known; None where no track has a height
+    """
+
+    position_m: Tensor
+    time_s: Tensor
+    agent_ids: tuple[str, ...] = ()
+    height_m: Tensor | None = None
+
+    def __post_init__(self) -> None:
+        shape = tuple(self.position_m.shape)
+        if len(shape) != 5 or shape[-1] != 2 or tuple(self.time_s.shape) != (shape[0], shape[3]):
+            raise ValueError(f"Tracks: position_m {shape}, expected [B, K, A, T, 2]; time_s {tuple(self.time_s.shape)}, [B, T]")
+        if self.agent_ids and len(self.agent_ids) != shape[2]:
+            raise ValueError(f"Tracks: {len(self.agent_ids)} names of {shape[2]} agents")
+        if self.height_m is not None and tuple(self.height_m.shape) != shape[:4]:
+            raise ValueError(f"Tracks.height_m has shape {tuple(self.height_m.shape)}, expected {shape[:4]}")
+
+
+class Evidence(Protocol):
+    """Something known that speaks about whole tracks: silence of a sensor, bearings, a statement of the user.
+
+    It holds what was observed where and when (sensors may move), in the mission's frame and time, so that it serves all
+    windows. `cadence.evidence` weighs hypotheses by it; of a window it is shown the steps up to the origin.
+    """
+
+    @property
+    def name(self) -> str:
+        """What tables, advice and the report call it."""
+        ...
+
+    def log_likelihood(self, tracks: Tracks) -> Tensor:
+        """How well each track fits: [B, K, A], or [B, K] where it speaks of all agents together.
+
+        The logarithm of the likelihood over the greatest that any track could have: zero where nothing speaks against a
+        track, never above zero, minus infinity where it cannot be. Agents that are no part of a hypothesis (NaN) add zero.
+        """
+        ...
+
+    def touches(self, time_s: Tensor) -> Tensor:
+        """Of which of the steps at `time_s` [B, T] it speaks [B, T]; windows without any are left as they are drawn."""
+        ...
+
+    def least_credible(self, time_s: Tensor) -> Tensor:
+        """Log likelihood [B] that at least one of many tracks over `time_s` [B, T] should reach.
+
+        Where no track does, the evidence contradicts what is drawn; it is told and not believed.
+        """
+        ...
+
+
+@dataclass(frozen=True, eq=False)
 class Context:
     """What is known of B windows beside the detections: where they are, and what estimators may read or must obey there.
 
@@ -60,6 +117,8 @@ class Context:
     tracker_m     [B, H, M, 2] positions of M moving trackers at the last H steps up to the origin, oldest first, in the
                   mission frame; NaN: absent
     obstacles     of the place, in the mission frame, the same for all windows; hypotheses keep out of them
+    evidence      what else speaks about tracks, the same for all windows; hypotheses are weighed by it (`cadence.evidence`)
+    agent_ids     names of the agents [A], by which evidence knows them; none where it need not
     """
 
     datum_m: Tensor
@@ -67,6 +126,8 @@ class Context:
     known_goal_m: Tensor | None = None
     tracker_m: Tensor | None = None
     obstacles: Obstacles = field(default_factory=Obstacles.none)
+    evidence: tuple[Evidence, ...] = ()
+    agent_ids: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         b = len(self.datum_m)
@@ -79,8 +140,8 @@ class Context:
 
     def __getitem__(self, windows: slice | Tensor) -> "Context":
         """The same for a selection of windows."""
-        given = {name: value[windows] for name, value in vars(self).items() if isinstance(value, Tensor)}
-        return Context(obstacles=self.obstacles, **given)
+        given: dict[str, Any] = {name: value[windows] for name, value in vars(self).items() if isinstance(value, Tensor)}
+        return replace(self, **given)
 
     def __len__(self) -> int:
         return len(self.datum_m)
@@ -159,11 +220,14 @@ class HypothesisSet:
     position_m [B, K, A, T, 2] metres relative to the window datum; NaN for agents that are not active
     weight     [B, K] non-negative, each row sums to one
     status     [B][A] "ok", "no_detections", "infeasible" (nothing keeps the limits), "scarce" (hardly anything does), ...
+    num_effective  [B, A] effective sample size: so many equally weighted tracks would tell as much; None where no evidence
+               weighs hypotheses
     """
 
     position_m: Tensor
     weight: Tensor
     status: tuple[tuple[str, ...], ...]
+    num_effective: Tensor | None = None
 
     def __post_init__(self) -> None:
         b, k, a = self.position_m.shape[:3]
@@ -173,6 +237,8 @@ class HypothesisSet:
             raise ValueError(f"HypothesisSet.weight has shape {tuple(self.weight.shape)}, expected {(b, k)}")
         if len(self.status) != b or any(len(row) != a for row in self.status):
             raise ValueError("HypothesisSet.status must hold one word per window and agent")
+        if self.num_effective is not None and tuple(self.num_effective.shape) != (b, a):
+            raise ValueError(f"HypothesisSet.num_effective has shape {tuple(self.num_effective.shape)}, expected {(b, a)}")
 
 
 class Estimator(Protocol):

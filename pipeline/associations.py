@@ -25,7 +25,7 @@ from cadence.constraints.obstacles import Obstacles
 from cadence.errors import InputError
 from cadence.resampling import systematic
 from cadence.seeds import part_seeds
-from cadence.types import WindowBatch
+from cadence.types import Evidence, WindowBatch
 from pipeline.grids import Grid, GridConfig, plan_grid
 from pipeline.tracks import DetectionTrack, track_of
 from pipeline.windows import MissionWindows, is_first_or_last, kept_tracks, middle_m, padded_detections, window_seeds
@@ -223,9 +223,9 @@ class AssociatedWindows:
     _each: tuple[_Window, ...]
     _pool: DetectionTrack
 
-    def located(self, start_ns: int, obstacles: Obstacles) -> "AssociatedWindows":
+    def located(self, start_ns: int, obstacles: Obstacles, evidence: tuple[Evidence, ...] = ()) -> "AssociatedWindows":
         """See `MissionWindows.located`."""
-        return replace(self, windows=self.windows.located(start_ns, obstacles))
+        return replace(self, windows=self.windows.located(start_ns, obstacles, evidence))
 
     def tracks(self, part: slice) -> tuple[MissionWindows, torch.Tensor]:
         """Some windows [b] whose columns are all different tracks, and the column of each hypothesis and agent [b, K, A].

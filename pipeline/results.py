@@ -20,6 +20,7 @@ class AgentHypotheses:
     datum_m     (x, y) in the mission frame
     position_m  [K, T, 2] float32 metres relative to the datum; K is 0 where nothing could be drawn; NaN in hypotheses
                 that the agent is no part of
+    num_effective  effective sample size of its tracks; None where no evidence weighs them
     probability, association_entropy_bits  of its being there, and of who caused its detections; None: their origin is known
     """
 
@@ -33,6 +34,7 @@ class AgentHypotheses:
     position_m: Float32s
     probability: float | None = None
     association_entropy_bits: float | None = None
+    num_effective: float | None = None
 
     @property
     def is_live(self) -> bool:
@@ -198,6 +200,7 @@ def _agent(row: dict[str, object], span: tuple[int, int] | None, rows: _Rows) ->
         position_m=rows.position_m[begin:end],
         probability=_optional_float(row.get("probability")),
         association_entropy_bits=_optional_float(row.get("association_entropy_bits")),
+        num_effective=_optional_float(row.get("num_effective")),
     )
 
 

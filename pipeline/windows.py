@@ -14,7 +14,7 @@ from torch import Tensor
 
 from cadence.arrays import Bools, Float64s, Int64s
 from cadence.constraints.obstacles import Obstacles
-from cadence.types import Context, Detections, WindowBatch
+from cadence.types import Context, Detections, Evidence, WindowBatch
 from pipeline.grids import Grid
 from pipeline.tracks import DetectionTrack, agent_tracks, interpolated
 
@@ -29,13 +29,14 @@ class MissionWindows:
     agent_ids: tuple[str, ...]
     datum_m: Float64s
 
-    def located(self, start_ns: int, obstacles: Obstacles) -> "MissionWindows":
+    def located(self, start_ns: int, obstacles: Obstacles, evidence: tuple[Evidence, ...] = ()) -> "MissionWindows":
         """The same windows with all that is known beside the detections of a mission that began at `start_ns`.
 
         Neither goals nor trackers are: logs do not say what they are.
         """
         elapsed_s = torch.from_numpy((self.origins_ns - start_ns).astype(np.float64) * 1e-9).clamp_min(0.0)
-        context = Context(torch.from_numpy(self.datum_m), elapsed_s, obstacles=obstacles)
+        datum_m, names = torch.from_numpy(self.datum_m), self.agent_ids
+        context = Context(datum_m, elapsed_s, obstacles=obstacles, evidence=evidence, agent_ids=names)
         return replace(self, batch=self.batch.with_context(context))
 
 

@@ -67,6 +67,10 @@ WINDOWS = pa.schema(
 )
 """One row per window and agent, also where no hypothesis could be drawn."""
 
+NUM_EFFECTIVE = pa.field("num_effective", pa.float64())
+"""A column that WINDOWS have where the log holds evidence: the effective sample size of an agent's tracks; null where nothing
+speaks of them."""
+
 ASSOCIATIONS = pa.schema(
     [
         pa.field("log_id", pa.string(), nullable=False),

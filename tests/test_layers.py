@@ -28,7 +28,7 @@ FLOORS = {
         {"arrays", "errors", "schedule"},
         {"constraints", "measurement", "metrics", "resampling", "seeds"},
         {"association", "stories", "types"},
-        {"answers", "bank", "recordings"},
+        {"answers", "bank", "evidence", "recordings"},
         {"network", "worlds"},
         {"diffusion"},
         {"baselines"},

@@ -26,6 +26,7 @@ class Loaded:
     grid           the grid that it takes, out of the configured one; `ConfigError` where it takes another one only
     fit            adapts it to a log; None: nothing adapts
     is_apart       it draws every agent by itself, whatever the others of a window do
+    num_past       so many steps before the first one of its grid it can draw as well, for evidence to be heard there
     """
 
     preset: str
@@ -33,6 +34,7 @@ class Loaded:
     grid: Callable[[GridConfig], GridConfig]
     fit: Callable[[FittingData], Fitted] | None = None
     is_apart: bool = False
+    num_past: int = 0
 
     def fitted(self, data: FittingData) -> Fitted:
         """The estimator for one log."""

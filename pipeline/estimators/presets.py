@@ -43,6 +43,7 @@ class Preset:
 
 READ_BY_ALL = (
     "checkpoint", "num_hypotheses", "seed", "device", "default_sigma_m", "is_strict", "is_associated", "association.",
+    "evidence.",
     "grid.stride_steps",
 )  # fmt: skip
 """Settings of [infer] that act whatever the preset."""

@@ -52,6 +52,7 @@ def _encode_agent(agent: AgentHypotheses) -> bytes:
         datum_y_m=agent.datum_m[1],
         probability=agent.probability,
         association_entropy_bits=agent.association_entropy_bits,
+        num_effective=agent.num_effective,
     )
     position: bytes = np.ascontiguousarray(agent.position_m, dtype="<f4").tobytes()
     return bytes(head.SerializeToString()) + (field(9, position) if position else b"")
@@ -80,7 +81,7 @@ def _add_state(state: Any, live: LiveAgent, now_ns: int) -> None:
     state.speed_mps = _to_plot(live.speed_mps(now_ns))
     state.entropy = _to_plot(numbers.weight_entropy(live.weight))
     state.num_modes = live.num_modes
-    for name in ("probability", "association_entropy_bits"):
+    for name in ("probability", "association_entropy_bits", "num_effective"):
         if getattr(agent, name) is not None:
             setattr(state, name, getattr(agent, name))
 

@@ -7,6 +7,7 @@ from cadence.diffusion.absolute import AbsoluteSampling
 from cadence.diffusion.feasible import GuidanceConfig
 from cadence.diffusion.general import SamplerName
 from cadence.diffusion.place import PlaceSampling
+from cadence.evidence.estimator import WeighingConfig
 from pipeline.checkpoints import DEFAULT
 from pipeline.estimators.samplings import GeneralSampling, Samplings
 from pipeline.grids import GridConfig
@@ -33,6 +34,7 @@ class InferConfig:
     is_strict        refuse a log that the checkpoint does not fit (`--strict`)
     is_associated    detections of unknown origin are told apart; otherwise they are taken for one agent called "unknown"
     association      how they are told apart
+    evidence         how hypotheses are weighed by what else speaks about tracks
     """
 
     num_hypotheses: int = 30
@@ -48,6 +50,7 @@ class InferConfig:
     is_associated: bool = True
     association: AssociationConfig = field(default_factory=AssociationConfig)
     grid: GridConfig = field(default_factory=GridConfig)
+    evidence: WeighingConfig = field(default_factory=WeighingConfig)
     guidance: GuidanceConfig = field(default_factory=GuidanceConfig)
     paper: AbsoluteSampling = field(default_factory=AbsoluteSampling)
     place: PlaceSampling = field(default_factory=PlaceSampling, metadata={"older_name": "scene"})

@@ -5,21 +5,23 @@ Chunks are pieces of work that know nothing of one another: `pipeline.threads.in
 
 import functools
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from cadence.types import Estimator
+from cadence.evidence.estimator import CONTRADICTED, FEW_FIT, WeighingConfig, weighed_as_drawn
+from cadence.types import Estimator, HypothesisSet
 from pipeline.associations import AssociatedWindows
 from pipeline.windows import MissionWindows
 
 _WINDOWS_AT_ONCE = 32
 _TRACKS_AT_ONCE = 48
-_WORST_FIRST = ("guidance_diverged", "infeasible", "scarce", "ok")
+_WORST_FIRST = ("guidance_diverged", "infeasible", CONTRADICTED, FEW_FIT, "scarce", "ok")
 
-Drawn = tuple[Tensor, Tensor, Tensor, list[list[str]]]
-"""Numbers of windows [b], positions [b, K, A, T, 2] about their datum, weights [b, K], status [b][A]."""
+Drawn = tuple[Tensor, HypothesisSet]
+"""Numbers of windows [b], and their hypotheses in float64."""
 Piece = Callable[[], Drawn]
 
 
@@ -31,7 +33,7 @@ def draw_windows(estimator: Estimator, windows: MissionWindows, num_hypotheses: 
 
 def _draw_part(estimator: Estimator, windows: MissionWindows, num_hypotheses: int, part: Tensor) -> Drawn:
     drawn = estimator.sample(windows.batch[part], num_hypotheses)
-    return part, drawn.position_m.double(), drawn.weight.double(), [list(row) for row in drawn.status]
+    return part, replace(drawn, position_m=drawn.position_m.double(), weight=drawn.weight.double())
 
 
 def _by_windows(num_windows: int) -> Iterator[Tensor]:
@@ -48,39 +50,50 @@ def _by_tracks(windows: MissionWindows) -> Iterator[Tensor]:
             yield part
 
 
-def draw_tracks(estimator: Estimator, associated: AssociatedWindows, num_hypotheses: int) -> Iterator[Piece]:
-    """For estimators that treat agents apart: every different track of a window is drawn once, and joined by association."""
+def draw_tracks(
+    estimator: Estimator, associated: AssociatedWindows, num_hypotheses: int, weighing: WeighingConfig
+) -> Iterator[Piece]:
+    """For estimators that treat agents apart: every different track of a window is drawn once, and joined by association.
+
+    Evidence weighs what is joined: it speaks of agents, not of tracks that may be theirs.
+    """
     for whole in _by_windows(associated.windows.batch.num_windows):
         begin = int(whole[0])
         windows, column = associated.tracks(slice(begin, begin + len(whole)))
         for piece in draw_windows(estimator, windows, num_hypotheses, is_apart=True):
-            yield functools.partial(_joined, begin, column, piece)
+            yield functools.partial(_joined, begin, column, piece, associated, weighing)
 
 
-def _joined(begin: int, all_columns: Tensor, piece: Piece) -> Drawn:
+def _joined(begin: int, all_columns: Tensor, piece: Piece, associated: AssociatedWindows, weighing: WeighingConfig) -> Drawn:
     """Agents [b, K, A] out of tracks [b, K, U]; NaN where an agent is not part of a hypothesis."""
-    part, position, weight, status = piece()
+    part, drawn = piece()
+    position = drawn.position_m
     column = all_columns[part]
     pick = column.clamp_min(0)[..., None, None].expand(-1, -1, -1, *position.shape[3:])
     joined = torch.where((column >= 0)[..., None, None], position.gather(2, pick), torch.nan)
-    found = [
-        [_worst([row[u] for u in used.unique().tolist() if u >= 0]) for used in columns.unbind(-1)]
-        for row, columns in zip(status, column, strict=True)
-    ]
-    return begin + part, joined, weight, found
+    found = tuple(
+        tuple(_worst([row[u] for u in used.unique().tolist() if u >= 0]) for used in columns.unbind(-1))
+        for row, columns in zip(drawn.status, column, strict=True)
+    )
+    whole = HypothesisSet(joined, drawn.weight, found)
+    return begin + part, weighed_as_drawn(whole, associated.windows.batch[begin + part], weighing)
 
 
 def _worst(status: list[str]) -> str:
     return next((word for word in _WORST_FIRST if word in status), "no_detections")
 
 
-def draw_associations(estimator: Estimator, associated: AssociatedWindows, num_hypotheses: int) -> Iterator[Piece]:
+def draw_associations(
+    estimator: Estimator, associated: AssociatedWindows, num_hypotheses: int, weighing: WeighingConfig
+) -> Iterator[Piece]:
     """For estimators whose agents see each other: every association is a window, drawn as often as it has hypotheses."""
     for part in _by_windows(associated.windows.batch.num_windows):
-        yield functools.partial(_draw_associated, estimator, associated, num_hypotheses, part)
+        yield functools.partial(_draw_associated, estimator, associated, num_hypotheses, weighing, part)
 
 
-def _draw_associated(estimator: Estimator, associated: AssociatedWindows, num_hypotheses: int, part: Tensor) -> Drawn:
+def _draw_associated(
+    estimator: Estimator, associated: AssociatedWindows, num_hypotheses: int, weighing: WeighingConfig, part: Tensor
+) -> Drawn:
     begin, num_agents = int(part[0]), len(associated.windows.agent_ids)
     some, window, count = associated.by_association(slice(begin, begin + len(part)))
     # hypotheses of a window by association: where those of each begin
@@ -99,4 +112,5 @@ def _draw_associated(estimator: Estimator, associated: AssociatedWindows, num_hy
         for row, words in zip(rows[:, 0].tolist(), drawn.status, strict=True):
             for agent, word in enumerate(words):
                 found[row][agent].add(word)
-    return part, position, weight, [[_worst(list(words)) for words in row] for row in found]
+    status = tuple(tuple(_worst(list(words)) for words in row) for row in found)
+    return part, weighed_as_drawn(HypothesisSet(position, weight, status), associated.windows.batch[part], weighing)

@@ -7,26 +7,30 @@ from torch import Tensor
 
 from cadence import metrics
 from cadence.constraints.speed import needed_speed
-from cadence.types import Detections
+from cadence.evidence.estimator import CONTRADICTED, FEW_FIT
+from cadence.types import Detections, HypothesisSet
 from pipeline.associations import AssociatedWindows
 from pipeline.grids import Grid
 from pipeline.windows import MissionWindows
-from schemas.tables import WINDOWS, hypotheses_schema
+from schemas.tables import NUM_EFFECTIVE, WINDOWS, hypotheses_schema
 
 ADVICE = {
     "ok": None,
     "no_detections": "not detected within this window's history; infer.grid.history_steps or step_s would widen it",
     "infeasible": "no way between detections keeps all limits; check obstacles and infer.guidance (margin_m, max_...)",
     "scarce": "hardly a draw keeps all limits, so these are narrower than what is known; check obstacles and infer.guidance",
+    CONTRADICTED: "what else is known (silence of sensors, ...) speaks against every track and was left out here; check the "
+    "sensors' footprints and clocks, or whether the target is another one",
+    FEW_FIT: "hardly any track fits what else is known, so these few may miss the target; a larger infer.evidence.most_draws "
+    "or infer.num_hypotheses draws more",
     "guidance_diverged": "sampling did not stay finite, so the bank's samples stand in; report this log",
 }
 """What to do about each status of a window."""
 
 
-def hypothesis_rows(
-    log_id: str, windows: MissionWindows, grid: Grid, part: Tensor, position: Tensor, weight: Tensor
-) -> pa.Table:
+def hypothesis_rows(log_id: str, windows: MissionWindows, grid: Grid, part: Tensor, drawn: HypothesisSet) -> pa.Table:
     """HYPOTHESES rows of the active agents, by window, hypothesis, agent."""
+    position, weight = drawn.position_m, drawn.weight
     active = windows.batch.is_active[part]
     b, k, a, t = position.shape[:4]
     is_row = active[:, None, :].expand(b, k, a)
@@ -53,11 +57,12 @@ def hypothesis_rows(
     return pa.Table.from_arrays([column.cast(item.type) for column, item in zip(columns, schema, strict=True)], schema=schema)
 
 
-def window_rows(
-    windows: MissionWindows, part: Tensor, position: Tensor, weight: Tensor, status: list[list[str]],
-    max_speed_mps: float | None = None,
-) -> pa.Table:  # fmt: skip
-    """WINDOWS rows of every agent; what is infeasible because detections ask for more than `max_speed_mps` says so."""
+def window_rows(windows: MissionWindows, part: Tensor, drawn: HypothesisSet, max_speed_mps: float | None = None) -> pa.Table:
+    """WINDOWS rows of every agent; what is infeasible because detections ask for more than `max_speed_mps` says so.
+
+    Where the log holds evidence they have one more column, the effective sample size.
+    """
+    position, weight, status = drawn.position_m, drawn.weight, drawn.status
     now = windows.batch.origin_index
     spread = metrics.spread(position[:, :, :, now : now + 1], weight)[..., 0]
     detections = windows.batch.detections[part]
@@ -79,6 +84,12 @@ def window_rows(
                 }
             )
     return pa.Table.from_pylist(rows, schema=WINDOWS)
+
+
+def with_effective(rows: pa.Table, drawn: HypothesisSet) -> pa.Table:
+    """WINDOWS rows of some windows with the effective sample size of each agent's tracks; null where nothing weighs them."""
+    num = np.full(rows.num_rows, np.nan) if drawn.num_effective is None else drawn.num_effective.numpy().reshape(-1)
+    return rows.append_column(NUM_EFFECTIVE, pa.array(num, pa.float64(), from_pandas=True))
 
 
 def _advice(status: str, seen: Detections, agent: int, max_speed_mps: float | None) -> str | None:

@@ -14,6 +14,8 @@ from cadence.association.counts import stream_counts
 from cadence.association.types import AssociationConfig
 from cadence.constraints.obstacles import Obstacles
 from cadence.errors import ImplausibleInputError
+from cadence.evidence.estimator import WithEvidence
+from cadence.types import Evidence
 from pipeline.associations import AssociatedWindows, Sources, build_associated_windows, tell_sources
 from pipeline.catalogue import read_catalogue
 from pipeline.checkpoints import DEFAULT, checkpoint_hash, read_info
@@ -23,7 +25,7 @@ from pipeline.estimators.loaded import Loaded
 from pipeline.estimators.presets import find_weights, load_estimator, refuse_unread
 from pipeline.infer.config import InferConfig
 from pipeline.infer.draws import Drawn, Piece, draw_associations, draw_tracks, draw_windows
-from pipeline.infer.rows import hypothesis_rows, window_rows, with_association
+from pipeline.infer.rows import hypothesis_rows, window_rows, with_association, with_effective
 from pipeline.manifest import StageResult, run_stage
 from pipeline.missions import CATALOGUE_NAME, no_mission
 from pipeline.obstacle_file import OBSTACLES_NAME, read_obstacles
@@ -66,7 +68,7 @@ def infer(
                 'the other, which takes a while; agent = "NAME" in [[extract.detections]] means one target, --start and --end '
                 "take a part"
             )
-        plan = _Plan.of(config, detections, read_obstacles(inputs[1]), start_ns)
+        plan = _Plan.of(config, detections, Beside(start_ns, read_obstacles(inputs[1])))
         for line in plan.suspicions.lines():
             progress.note(f"infer: suspected {line}")
         drawn = in_order(plan.draws, num_threads or num_cores())
@@ -111,10 +113,11 @@ def _draw(plan: "_Plan", draws: Iterable[Drawn], log_id: str, folder: Path, fram
     parts, statuses = [], []
     num_windows, begun_s, is_told, num_done = plan.windows.batch.num_windows, time.monotonic(), False, 0
     with progress.bar(num_windows, "infer", unit="window") as bar:
-        for part, positions, weight, status in draws:
-            parts.append(hypothesis_rows(log_id, plan.windows, plan.seen.sources.grid, part, positions, weight))
-            rows = window_rows(plan.windows, part, positions, weight, status, plan.max_speed_mps)
-            statuses.append(rows if plan.seen.associated is None else with_association(rows, plan.seen.associated, part))
+        for part, drawn in draws:
+            parts.append(hypothesis_rows(log_id, plan.windows, plan.seen.sources.grid, part, drawn))
+            rows = window_rows(plan.windows, part, drawn, plan.max_speed_mps)
+            rows = rows if plan.seen.associated is None else with_association(rows, plan.seen.associated, part)
+            statuses.append(with_effective(rows, drawn) if plan.has_evidence else rows)
             bar.update(len(part))
             num_done, taken_s = num_done + len(part), time.monotonic() - begun_s
             if not is_told and taken_s > _FIRST_S:
@@ -139,6 +142,15 @@ def _tell_cost(num_windows: int, seconds: float, progress: Progress) -> None:
             f"infer: {num_windows} windows, about {seconds / 60.0:.0f} min by the first ones; "
             "a larger infer.grid.stride_steps takes fewer"
         )
+
+
+@dataclass(frozen=True, eq=False)
+class Beside:
+    """What is known of a mission beside its detections: when it began, its obstacles, what else speaks about tracks."""
+
+    start_ns: int
+    obstacles: Obstacles
+    evidence: tuple[Evidence, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,6 +201,7 @@ class _Plan:
     about: Mapping[str, Any]
     suspicions: Suspicions
     max_speed_mps: float | None
+    has_evidence: bool
 
     @property
     def found(self) -> list[str]:
@@ -197,28 +210,31 @@ class _Plan:
         return [words] if words else []
 
     @staticmethod
-    def of(config: InferConfig, detections: pa.Table, obstacles: Obstacles, start_ns: int) -> "_Plan":
+    def of(config: InferConfig, detections: pa.Table, beside: Beside) -> "_Plan":
         """The draws of a log by the checkpoint, which decides the grid as well, or by the default one where it does not fit."""
         loaded = load_estimator(config.checkpoint, config.samplings)
         seen = _Seen.of(config, detections, loaded)
         data = FittingData.of(seen.sources.named, seen.sources.grid, seen.named, config.default_sigma_m)
         suspicions, about = Suspicions(), seen.about(config.association)
         if config.is_tested and loaded.fit is None:
-            test = fit_test(loaded.estimator, data, seen.named.located(start_ns, obstacles))
+            test = fit_test(loaded.estimator, data, seen.named.located(beside.start_ns, beside.obstacles))
             if test is not None and test.is_misfit:
                 _suspect(test, config, suspicions)
-                plan = _Plan.of(replace(config, checkpoint=DEFAULT), detections, obstacles, start_ns)
+                plan = _Plan.of(replace(config, checkpoint=DEFAULT), detections, beside)
                 return replace(plan, suspicions=suspicions, about={**plan.about, "fit_test": asdict(test)})
             about["fit_test"] = None if test is None else asdict(test)
         fitted = loaded.fitted(data)
-        estimator, num = fitted.estimator, config.num_hypotheses
+        num, evidence = config.num_hypotheses, beside.evidence if config.evidence.is_used else ()
         if seen.associated is None:
-            draws = draw_windows(estimator, seen.named.located(start_ns, obstacles), num, loaded.is_apart)
+            weighed = WithEvidence(fitted.estimator, config.evidence, loaded.is_apart, loaded.num_past)
+            located = seen.named.located(beside.start_ns, beside.obstacles, evidence)
+            draws = draw_windows(weighed, located, num, loaded.is_apart)
         else:
-            associated = seen.associated.located(start_ns, obstacles)
-            draws = (draw_tracks if loaded.is_apart else draw_associations)(estimator, associated, num)
+            associated = seen.associated.located(beside.start_ns, beside.obstacles, evidence)
+            draw = draw_tracks if loaded.is_apart else draw_associations
+            draws = draw(fitted.estimator, associated, num, config.evidence)
         about = {**fitted.about, **about}
-        return _Plan(config.checkpoint, seen, draws, about, suspicions, config.guidance.max_speed_mps)
+        return _Plan(config.checkpoint, seen, draws, about, suspicions, config.guidance.max_speed_mps, bool(evidence))
 
     @property
     def windows(self) -> MissionWindows:

@@ -100,6 +100,7 @@ class WindowRow:
     age_s: float | None
     spread_m: float | None
     probability: float | None = None
+    num_effective: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -311,7 +312,7 @@ def _window_rows(found: MissionHypotheses, agents: tuple[str, ...]) -> tuple[Win
     return tuple(
         WindowRow(
             window.window, place[agent.agent_id], window.origin_ns, agent.status, agent.advice or "", agent.num_detections,
-            agent.age_s, agent.spread_m, agent.probability,
+            agent.age_s, agent.spread_m, agent.probability, agent.num_effective,
         )
         for window in found.windows
         for agent in sorted(window.agents, key=lambda agent: place[agent.agent_id])

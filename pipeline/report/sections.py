@@ -40,6 +40,8 @@ def moments_section(mission: Mission, analysis: Analysis, moments: Sequence[Mome
         words += [f"last seen {duration(abs(round(age, 1)))} before"] if age is not None else []
         words += ["seen only once until then"] if row is not None and row.num_detections == 1 else []
         words += [f"a hypothesis is {metres(error_m)} from the truth"] if np.isfinite(error_m) else []
+        if row is not None and row.num_effective is not None:
+            words += [f"its {len(fan.weight)} hypotheses tell as much as {row.num_effective:.0f} equal ones"]
         words += _ways(strands, fan.origin_index)
         steps = _moment_steps(mission, fan, share)
         if share < 1:

@@ -202,7 +202,7 @@ def drawn(table: pa.Table, weights: Path) -> torch.Tensor:
     grid = plan_grid(table, loaded.grid(GRID))
     windows = build_windows(table, grid, 5)
     estimator = loaded.fitted(FittingData.of(table, grid, windows)).estimator
-    parts = [piece()[1] for piece in draw_windows(estimator, windows, CONFIG.num_hypotheses, loaded.is_apart)]
+    parts = [piece()[1].position_m for piece in draw_windows(estimator, windows, CONFIG.num_hypotheses, loaded.is_apart)]
     return torch.cat(parts) + torch.from_numpy(windows.datum_m)[:, None, None, None]
 
 

@@ -26,6 +26,7 @@ from cadence.association.types import AssociationConfig, AssociationHypotheses
 from cadence.constraints.obstacles import Obstacles
 from cadence.diffusion.absolute import AbsoluteSampling
 from cadence.errors import InputError
+from cadence.evidence.estimator import WeighingConfig
 from cadence.types import Detections, HypothesisSet, WindowBatch
 from pipeline import associations
 from pipeline.associations import AssociatedWindows, DataAssociation, build_associated_windows, shared_out, tell_sources
@@ -116,9 +117,10 @@ def test_every_association_is_a_window_for_estimators_of_several_agents() -> Non
 
     start_ns = int(found.windows.origins_ns[1]) - 10**9
     located = found.located(start_ns, Obstacles.none())
-    (piece,) = draw_associations(Counting(), located, 8)
-    part, position, weight, status = piece()
-    assert part.tolist() == [0, 1] and status == [["ok", "ok"], ["ok", "ok"]]
+    (piece,) = draw_associations(Counting(), located, 8, WeighingConfig())
+    part, found_set = piece()
+    position, weight = found_set.position_m, found_set.weight
+    assert part.tolist() == [0, 1] and found_set.status == (("ok", "ok"), ("ok", "ok"))
     torch.testing.assert_close(weight, torch.full((2, 8), 0.125, dtype=torch.float64))
     assert position[1, :, 0, 0, 0].tolist() == [1.0] * 8
     assert position[1, :, 0, 0, 1].tolist() == [4] * 4 + [3] * 3 + [4]
