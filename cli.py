@@ -31,6 +31,7 @@ app = typer.Typer(
 
     \b
       cadence info LOG.mcap                 what is in a log, and the settings that fit it
+      cadence import TABLE --out LOG.mcap   a log of CSV, Parquet or GeoJSON
       cadence run LOG.mcap --out results    everything: side file for Foxglove, layout, report
       cadence COMMAND --help                options and examples of one command
 
@@ -70,6 +71,23 @@ Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress on stder
 Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON on stdout.")]
 Seed = Annotated[
     int | None, typer.Option("--seed", metavar="N", help="Seed of everything random; the same seed repeats the result.")
+]
+Columns = Annotated[
+    list[str] | None,
+    typer.Option("--column", metavar="FIELD=COLUMN", help="What a column holds, also FIELD=COLUMN:UNIT; FIELD= leaves it out."),
+]
+Zone = Annotated[str, typer.Option(metavar="ZONE", help="Of times that state none: UTC, +02:00, Europe/Paris.")]
+TimeForm = Annotated[
+    str, typer.Option("--time", metavar="FORM", help="s, ms, us, ns; day-first, month-first; or '%d/%m/%Y %H:%M'.")
+]
+Zero = Annotated[str | None, typer.Option(metavar="MOMENT", help="When times that are numbers count from, with its zone.")]
+Unit = Annotated[str, typer.Option(metavar="UNIT", help="Of positions: deg, rad, '1e-7 deg', ddmm.mm; m, km, ft.")]
+Agent = Annotated[str, typer.Option(metavar="NAME", help="Who was seen, in all rows.")]
+SensorName = Annotated[str, typer.Option("--sensor", metavar="NAME", help="Who saw it, in all rows.")]
+Sigma = Annotated[float | None, typer.Option(metavar="METRES", help="Standard deviation where the table states none.")]
+Table = Annotated[Path, typer.Argument(metavar="TABLE", help="CSV, Parquet or GeoJSON of positions.", show_default=False)]
+LogOut = Annotated[
+    Path | None, typer.Option("--out", metavar="LOG.mcap", help="The log; without it the table is only looked at.")
 ]
 Checkpoint = Annotated[str | None, typer.Option(metavar="NAME", help="Evaluate its forecasts on the logs in MISSION.")]
 ForecastOut = Annotated[Path | None, typer.Option("--out", metavar="DIR", help="For the forecasts' scores; default: MISSION.")]
@@ -125,6 +143,33 @@ def doctor(logs: Logs, quiet: Quiet = False, as_json: Json = False) -> int:
     found = diagnose_all(logs, Progress(quiet))
     typer.echo(to_json(found) if as_json else "\n\n".join(map(render, found)))
     return exit_code(found)
+
+
+@app.command("import")
+def import_(
+    table: Table, out: LogOut = None, column: Columns = None, time: TimeForm = "", zone: Zone = "", zero: Zero = None,
+    unit: Unit = "", agent: Agent = "", sensor: SensorName = "", sigma: Sigma = None, force: Force = False,
+    quiet: Quiet = False, as_json: Json = False,
+) -> None:  # fmt: skip
+    """Make a log of a table of positions.
+
+    CSV, Parquet or GeoJSON of points, with a time and a position a row. What each column holds is guessed and shown; what is
+    in doubt is refused. Fields: time, date, latitude, longitude, north_south, east_west, x, y, altitude, agent, sensor,
+    sigma, cov_xx, cov_xy, cov_yy, truth.
+
+    \b
+    Examples:
+      cadence import AIS_2026_11_28.csv
+      cadence import AIS_2026_11_28.csv --out ais.mcap
+      cadence import plots.csv --out plots.mcap --column time=T --zone Europe/Paris --time day-first --sigma 25
+      cadence import run7.parquet --out run7.mcap --zero 2026-05-01T12:00:00Z --time s --column x=px --column y=py
+    """
+    from pipeline.importing.shown import render
+    from pipeline.importing.stage import import_settings, import_table
+
+    settings = import_settings(column or (), time, zone, zero, unit, agent, sensor, sigma)
+    imported = import_table(table, out, settings, Progress(quiet), force)
+    typer.echo(to_json(imported) if as_json else render(imported))
 
 
 @app.command()

@@ -23,7 +23,9 @@ import cli
 from pipeline.config import TABLES
 from pipeline.mapping.message_types import MESSAGE_TYPES
 
-COMMANDS = ("info", "doctor", "run", "ingest", "extract", "infer", "export", "report", "evaluate", "simulate", "train")
+COMMANDS = (
+    "info", "doctor", "import", "run", "ingest", "extract", "infer", "export", "report", "evaluate", "simulate", "train",
+)  # fmt: skip
 
 CLI_INTRODUCTION = """# Command line
 

@@ -43,7 +43,7 @@ RECURRENT_LAYERS = {"LSTM", "GRU", "RNN", "LSTMCell", "GRUCell", "RNNCell"}
 
 MAX_FILE_LINES = 400
 MAX_FUNCTION_LINES = 60
-LONG_FILES: dict[str, str] = {}  # path: the reason why it is one file
+LONG_FILES: dict[str, str] = {"cli.py": "one function and its help a command"}  # path: the reason why it is one file
 RECURRENT_FILE = "cadence/network/recurrent.py"  # where they are kept in float32
 LONG_FUNCTIONS: dict[str, str] = {}  # path::function: the reason why it is one function
 

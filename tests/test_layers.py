@@ -58,7 +58,7 @@ FLOORS = {
         {"windows"},
         {"catalogue", "associations"},
         {"estimators", "scoring"},
-        {"ingest", "extract", "infer", "export", "report", "simulate"},  # no stage imports another
+        {"ingest", "extract", "infer", "export", "report", "simulate", "importing"},  # no stage imports another
         {"episodes"},
         {"forecast", "train"},
         {"evaluate"},
@@ -193,7 +193,7 @@ def test_exceptions_from_the_limits_are_needed():
 
 def test_command_line_stays_thin():
     # most of it is help: a docstring with examples for each of the commands
-    assert len((ROOT / "cli.py").read_text(encoding="utf-8").splitlines()) < 380
+    assert len((ROOT / "cli.py").read_text(encoding="utf-8").splitlines()) < 440
 
 
 def test_top_level_is_what_the_plan_says():

@@ -27,7 +27,8 @@ FIXES: Final[dict[str, MessageType]] = {
     "GPSFix": replace(
         geodetic("gps_msgs.GPSFix"), schemas=("gps_msgs.GPSFix", "gps_common.GPSFix"), where=("status.status >= 0",)
     ),
-    "LocationFix": geodetic("foxglove.LocationFix"),
+    # As JSON it may say who was seen and who saw it: `cadence import` writes it so.
+    "LocationFix": replace(geodetic("foxglove.LocationFix"), agent=("agent_id",), sensor=("sensor_id",)),
     "LocationFixes": replace(
         geodetic("foxglove.LocationFixes", "fixes[:]."),
         time=tuple(f"fixes[:].{path}" for path in TIME_PATHS),

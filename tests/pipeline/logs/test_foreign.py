@@ -1,11 +1,14 @@
 """What is no log: what it is instead, and the way on, which is walked."""
 
+import json
 import re
+import shlex
 import subprocess
 import sys
-import tomllib
 from pathlib import Path
 
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from fixtures.line_logs import straight_line, write_log
 from rosbags.rosbag1 import Writer as BagWriter
@@ -14,15 +17,8 @@ from rosbags.typesys import Stores, get_typestore
 
 import cli
 from cadence.errors import InputError
-from pipeline.config import read_config
-from pipeline.extract.config import ExtractConfig
-from pipeline.extract.stage import write_tables
 from pipeline.logs.reader import open_log
 from pipeline.missions import find_missions
-from pipeline.progress import Progress
-from pipeline.tables import read_table
-
-DOCS = Path(__file__).resolve().parents[3] / "docs" / "formats.md"
 
 
 def write_bag(path: Path) -> Path:
@@ -70,21 +66,30 @@ def test_bags_are_told_how_to_become_logs(name, tmp_path):
     assert open_log(part).health.num_messages == 30
 
 
-def test_a_table_is_told_where_it_says_how_and_that_works(tmp_path, monkeypatch):
+@pytest.mark.parametrize("name", ["plots.csv", "plots.parquet", "plots.geojson"])
+def test_a_table_is_told_the_command_that_makes_a_log_of_it_and_that_works(name, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    rows = [f"{1_700_000_000 + i},{3 * i},{2 * i},ferry-7" for i in range(20)]
-    (tmp_path / "plots.csv").write_text("\n".join(["time_s,x_m,y_m,agent", *rows]) + "\n")
-    with pytest.raises(InputError, match=r"plots\.csv: is not an MCAP file but a table as text; docs/formats\.md shows how"):
-        open_log("plots.csv")
-    assert "plots.csv is a table as text" in refusal(tmp_path)
-    part = DOCS.read_text(encoding="utf-8").partition("### From bags and tables")[2]
-    script, settings = (re.search(rf"```{kind}\n(.*?)```", part, re.DOTALL)[1] for kind in ("python", "toml"))
-    exec(compile(script, "docs/formats.md", "exec"), {})
-    config = read_config(ExtractConfig, tomllib.loads(settings)["extract"])
-    (tmp_path / "out").mkdir()
-    write_tables(open_log("plots.mcap"), tmp_path / "out", config, Progress(quiet=True))
-    table, _ = read_table(tmp_path / "out" / "detections.parquet", "detections")
-    assert table["x_m"].to_pylist() == [3 * i for i in range(20)] and set(table["agent_id"].to_pylist()) == {"ferry-7"}
+    columns = {
+        "time_s": [1_700_000_000 + i for i in range(20)],
+        "x_m": [3.0 * i for i in range(20)],
+        "y_m": [2.0 * i for i in range(20)],
+    }
+    columns["agent"] = ["ferry-7"] * 20
+    if name.endswith(".csv"):
+        lines = zip(*columns.values(), strict=True)
+        Path(name).write_text("\n".join([",".join(columns), *(",".join(map(str, line)) for line in lines)]) + "\n")
+    elif name.endswith(".parquet"):
+        pq.write_table(pa.table(columns), name)
+    else:
+        place = {"type": "Point", "coordinates": [8.5, 50.0]}
+        feature = {"type": "Feature", "properties": {"time": 1_700_000_000, "agent": "ferry-7"}, "geometry": place}
+        Path(name).write_text(json.dumps({"type": "FeatureCollection", "features": [feature]}))
+    assert cli.main(["run", name, "--out", "out", "-q"]) == 3
+    told = capsys.readouterr().err
+    command = re.search(r"`cadence (.*?)` makes a log of its positions", told)
+    assert command and told.count("\n") == 1 and f"{name} is " in refusal(tmp_path)
+    assert cli.main(shlex.split(command[1])) == 0
+    assert open_log("plots.mcap").health.num_messages == (1 if name.endswith("json") else 20)
 
 
 def test_folders_without_logs_say_what_they_are(tmp_path, capsys):
