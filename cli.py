@@ -33,6 +33,7 @@ app = typer.Typer(
       cadence info LOG.mcap                 what is in a log, and the settings that fit it
       cadence import TABLE --out LOG.mcap   a log of CSV, Parquet or GeoJSON
       cadence run LOG.mcap --out results    everything: side file for Foxglove, layout, report
+      cadence view results/LOG              the report, in a browser
       cadence COMMAND --help                options and examples of one command
 
     Exit codes: 0 ok, 1 defect, 2 wrong call, 3 unusable input, 4 configuration, 5 device or storage, 7 damaged input,
@@ -89,6 +90,10 @@ Table = Annotated[Path, typer.Argument(metavar="TABLE", help="CSV, Parquet or Ge
 LogOut = Annotated[
     Path | None, typer.Option("--out", metavar="LOG.mcap", help="The log; without it the table is only looked at.")
 ]
+ViewTarget = Annotated[str, typer.Argument(metavar="LOG|RESULTS", help="A log, or what run made of one.", show_default=False)]
+ViewOut = Annotated[str, typer.Option("--out", metavar="DIR", help="Folder for the results of a log.")]
+Served = Annotated[bool, typer.Option("--serve", help="Serve the folder to this machine, and print the address.")]
+Port = Annotated[int, typer.Option(metavar="N", help="Port to serve at; 0: a free one.")]
 Checkpoint = Annotated[str | None, typer.Option(metavar="NAME", help="Evaluate its forecasts on the logs in MISSION.")]
 ForecastOut = Annotated[Path | None, typer.Option("--out", metavar="DIR", help="For the forecasts' scores; default: MISSION.")]
 
@@ -331,6 +336,28 @@ def evaluate(
 
     resolved = stage_config(EvaluateConfig, "evaluate", config, settings or (), seed)
     _show(evaluate_any(mission, checkpoint, out, resolved, Progress(quiet), force), as_json)
+
+
+@app.command()
+def view(
+    target: ViewTarget, out: ViewOut = "results", served: Served = False, port: Port = 0, config: Config = None,
+    settings: Set = None, force: Force = False, quiet: Quiet = False,
+) -> int:  # fmt: skip
+    """Open the report in a browser.
+
+    Of a log what is missing is run first, into DIR/<its name>; results keep the settings that they were made with. Where
+    there is no browser, or with --serve, the folder is served to this machine alone, until Ctrl-C; a folder of missions is
+    served with a list of them.
+
+    \b
+    Examples:
+      cadence view flight.mcap
+      cadence view results/flight
+      cadence view results --serve --port 8080
+    """
+    from pipeline.view.stage import view as show
+
+    return show(target, out, config, settings or (), Progress(quiet), typer.echo, _complain, served, port, force)
 
 
 @app.command()

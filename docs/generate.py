@@ -24,7 +24,8 @@ from pipeline.config import TABLES
 from pipeline.mapping.message_types import MESSAGE_TYPES
 
 COMMANDS = (
-    "info", "doctor", "import", "run", "ingest", "extract", "infer", "export", "report", "evaluate", "simulate", "train",
+    "info", "doctor", "import", "run", "ingest", "extract", "infer", "export", "report", "evaluate", "view",
+    "simulate", "train",
 )  # fmt: skip
 
 CLI_INTRODUCTION = """# Command line

@@ -16,11 +16,12 @@ from pipeline.progress import Progress
 
 ROOT = Path(__file__).resolve().parents[1]
 COMMANDS = (
-    "info", "doctor", "import", "run", "ingest", "extract", "infer", "export", "report", "evaluate", "simulate", "train",
+    "info", "doctor", "import", "run", "ingest", "extract", "infer", "export", "report", "evaluate", "view",
+    "simulate", "train",
 )  # fmt: skip
 
 
-NO_STAGES = ("info", "doctor", "import")  # these have no settings in files
+NO_STAGES = ("info", "doctor", "import", "view")  # these have no settings in files
 
 
 def test_help_names_every_command(capsys):

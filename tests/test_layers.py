@@ -63,7 +63,7 @@ FLOORS = {
         {"forecast", "train"},
         {"evaluate"},
         {"batch", "inspect"},
-        {"front"},
+        {"front", "view"},
     ),
 }
 
@@ -193,7 +193,7 @@ def test_exceptions_from_the_limits_are_needed():
 
 def test_command_line_stays_thin():
     # most of it is help: a docstring with examples for each of the commands
-    assert len((ROOT / "cli.py").read_text(encoding="utf-8").splitlines()) < 440
+    assert len((ROOT / "cli.py").read_text(encoding="utf-8").splitlines()) < 500
 
 
 def test_top_level_is_what_the_plan_says():
