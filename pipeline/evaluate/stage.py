@@ -27,7 +27,7 @@ from pipeline.missions import is_mission_directory
 from pipeline.obstacle_file import OBSTACLES_NAME
 from pipeline.progress import Progress
 from pipeline.results import read_hypothesis_tables
-from pipeline.scoring.case import LABELS_NAME, Case, collision_test, read_case
+from pipeline.scoring.case import LABELS_NAME, Case, collision_test, mission_obstacles, read_case
 from pipeline.scoring.motion import MotionLaws, true_motion
 from pipeline.scoring.scores import Cells, Draw, IsInside, score_in_chunks
 from pipeline.windows import build_windows
@@ -142,7 +142,8 @@ def score_mission(directory: Path, config: EvaluateConfig, progress: Progress) -
     case = read_case(directory, stored, config.max_truth_gap_s, config.gospa_cutoff_m, config.seed)
     windows, scored, num_hypotheses = case.windows, case.scored, case.num_hypotheses
     fitting = _fitting(case, config.seed)
-    collides = collision_test(directory, windows)
+    obstacles = mission_obstacles(directory)
+    collides = collision_test(obstacles, windows)
     truth = true_motion(scored, case.truth_m, case.is_known)
     with progress.bar(windows.batch.num_windows * (1 + len(config.rivals)), "evaluate", "window") as bar:
 
@@ -184,7 +185,7 @@ def score_mission(directory: Path, config: EvaluateConfig, progress: Progress) -
         true_motion=truth.laws(),
         gospa_cutoff_m=case.cutoff_m if case.is_joint else None,
         is_matched=case.is_matched,
-        true_collision_share=_collision_share(collision_test(directory, windows, are_ways_straight=False), case),
+        true_collision_share=_collision_share(collision_test(obstacles, windows, are_ways_straight=False), case),
     )
 
 

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from cadence.constraints.checker import segments_in_collision, states_in_collision
+from cadence.constraints.obstacles import Obstacles
 from cadence.errors import InputError
 from cadence.types import HypothesisSet, WindowBatch
 from pipeline.associations import DataAssociation, Sources, build_associated_windows
@@ -165,14 +166,21 @@ def _stored_grid(stored: MissionHypotheses, directory: Path, context_steps: int 
     )  # fmt: skip
 
 
-def collision_test(directory: Path, windows: MissionWindows, are_ways_straight: bool = True) -> IsInside | None:
+def mission_obstacles(directory: Path) -> Obstacles | None:
+    """What stands in the way of a mission directory; None where nothing does."""
+    path = directory / OBSTACLES_NAME
+    obstacles = read_obstacles(path) if path.is_file() else None
+    return obstacles if obstacles is not None and obstacles.count else None
+
+
+def collision_test(
+    obstacles: Obstacles | None, windows: MissionWindows, are_ways_straight: bool = True
+) -> IsInside | None:
     """Which states touch an obstacle, themselves or on the straight way from the step before; None without obstacles.
 
     `are_ways_straight`: false of the truth, of which the way between two steps is not known.
     """
-    path = directory / OBSTACLES_NAME
-    obstacles = read_obstacles(path) if path.is_file() else None
-    if obstacles is None or obstacles.count == 0:
+    if obstacles is None:
         return None
 
     def collides(position_m: Tensor, index: Tensor) -> Tensor:

@@ -6,7 +6,7 @@ from foxglove_schemas_protobuf.LinePrimitive_pb2 import LinePrimitive
 from foxglove_schemas_protobuf.SceneEntityDeletion_pb2 import SceneEntityDeletion
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 
-from benchmarks.log_writing import point_by_point
+from benchmarks.log_writing_usual import point_by_point
 from pipeline.export.scene import Entity, Label, Lines, LineType, Spheres, encode_scene, encode_time, round_positions
 
 TIME_NS = 1_700_000_000_250_000_000
