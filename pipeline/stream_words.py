@@ -3,6 +3,8 @@
 from collections.abc import Mapping
 from typing import Any
 
+from pipeline.counted import counted
+
 _SURE = 0.5
 
 
@@ -14,12 +16,12 @@ def stream_words(record: Mapping[str, Any]) -> str:
     stated = record.get("stated", ())
     low, high, probability = counts["num_agents_low"], counts["num_agents_high"], counts["num_agents_probability"]
     if "num_agents" in stated:
-        agents = f"{counts['num_agents']} agents were detected (the number is stated)"
+        agents = counted(counts["num_agents"], "agent was", "agents were") + " detected (the number is stated)"
     elif probability < _SURE:
         agents = f"how many agents there are cannot be told ({low} to {high}; {counts['num_agents']} is the likeliest)"
     else:
         spread = "" if low == high else f", 95 %: {low} to {high}"
-        agents = f"{counts['num_agents']} agents (probability {probability:.2f}{spread})"
+        agents = f"{counted(counts['num_agents'], 'agent')} (probability {probability:.2f}{spread})"
     told = f"{_percent(counts['clutter'])} of the detections are clutter"
     parts = [agents, told + (" (the share that was expected is stated)" if "clutter_share" in stated else "")]
     if counts["detection"] is not None:

@@ -35,7 +35,11 @@ FLOORS = {
         {"training"},
     ),
     "pipeline": (
+<<<<<<< HEAD
         {"clock", "documents", "lengths", "moments", "out_of_memory", "suggestions"},
+=======
+        {"counted", "documents", "out_of_memory", "suggestions"},
+>>>>>>> 798aeeb (pipeline: one agent, two agents: numbers fit their nouns)
         {
             "accuracies",
             "arrays",

@@ -8,6 +8,7 @@ from typing import Any, get_args
 
 from cadence.errors import ImplausibleInputError, PartialInputError
 from pipeline.batch.outcome import LogOutcome, Status
+from pipeline.counted import counted
 from pipeline.manifest import StageResult
 from pipeline.score_words import METRICS, estimator_words, value_words
 from pipeline.stores.urls import shown
@@ -126,12 +127,13 @@ def _assumptions(summary: Mapping[str, Any]) -> list[str]:
         return []
     of = f" of {', '.join(list(unnamed)[:4])}{' and others' if len(unnamed) > 4 else ''}" if unnamed else ""
     num_agents = 1 if found is None else found["num_agents"]
-    told = "were taken for one target" if num_agents == 1 else f"were told apart as those of {num_agents} targets"
+    told = "were taken for one target" if num_agents == 1 else f"were told apart as those of {counted(num_agents, 'target')}"
     paths = {path for path in unnamed.values() if path is not None}
     ways = [f'agent_path = "{path}" in [[extract.detections]] reads it from the messages' for path in sorted(paths)[:1]]
     ways += ['agent = "NAME" there means one target'] * (num_agents != 1)
     ways.append("infer.association.num_agents = N is how many there are")
-    return [f"{num} detections{of} do not say whose they are and {told}; to have it otherwise: {', '.join(ways)}"]
+    who = counted(num, f"detection{of} does", f"detections{of} do")
+    return [f"{who} not say whose they are and {told}; to have it otherwise: {', '.join(ways)}"]
 
 
 def _to_open(outcomes: Sequence[LogOutcome]) -> list[str]:

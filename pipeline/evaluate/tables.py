@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from cadence.arrays import Int64s
+from pipeline.counted import counted
 from pipeline.evaluate.joint import JOINT_METRICS, JointCells, block_of, summarise_joint
 from pipeline.plain_rows import rows_as_csv, without_nan
 from pipeline.score_words import coverage_words, estimator_words
@@ -260,11 +261,12 @@ def _preface(report: ScoreReport) -> list[str]:
     for log in report.logs[:20]:
         spared = f"; {log.num_unscored} window-agent pairs had no hypotheses and are spared" if log.num_unscored else ""
         lines.append(
-            f"* {log.log_id}: {log.num_windows} windows, {log.num_agents} agents, {log.num_hypotheses} hypotheses, "
+            f"* {log.log_id}: {counted(log.num_windows, 'window')}, {counted(log.num_agents, 'agent')}, "
+            f"{counted(log.num_hypotheses, 'hypothesis', 'hypotheses')}, "
             f"step {log.step_s:g} s, truth interpolated over at most {log.max_truth_gap_s:g} s{spared}"
         )
     if len(report.logs) > 20:
-        lines.append(f"* and {len(report.logs) - 20} more logs")
+        lines.append(f"* and {counted(len(report.logs) - 20, 'more log')}")
     return [*lines, ""]
 
 

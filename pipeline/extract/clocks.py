@@ -11,6 +11,7 @@ from typing import Final
 import numpy as np
 
 from cadence.arrays import Bools, Float64s, Int64s, Objects
+from pipeline.counted import counted
 from pipeline.extract.positions import Names
 
 AHEAD_S: Final = 2.0
@@ -246,7 +247,7 @@ def _judge_jumps(stamps: Stamps, segments: list[Int64s]) -> Judgement:
     if all(abs(step) < log for step, log in zip(steps_s, log_s, strict=True)):  # it is the log's clock that was set
         return Judgement(None, "", ~no_row, no_row)
     jumps = ", ".join(f"{step:+.4g}" for step in steps_s[:3]) + " and so on" * (len(steps_s) > 3)
-    fault = f"stamps jump {len(borders)} times (by {jumps} s) while the log goes on"
+    fault = f"stamps jump {counted(len(borders), 'time')} (by {jumps} s) while the log goes on"
     is_first[: segments[1][0]] = True
     if min(np.isin(stamps.time_ns[part], stamps.time_ns[is_first]).mean() for part in segments[1:]) >= _COPIED:
         fault = f"{fault}, back to stamps that were there before: a recording was played {len(segments)} times"

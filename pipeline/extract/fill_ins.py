@@ -7,6 +7,7 @@ from typing import Final
 import numpy as np
 
 from cadence.arrays import Bools
+from pipeline.counted import counted
 from pipeline.extract.positions import Positions
 from pipeline.frames import DEGREE_M
 from pipeline.suspicions import Suspicions
@@ -38,10 +39,11 @@ def without_fill_ins(rows: Positions, role: str, suspicions: Suspicions) -> Posi
     if not is_fill_in.any():
         return rows
     places = sorted(set(zip(rows.first[is_fill_in], rows.second[is_fill_in], strict=True)))
+    found = counted(int(is_fill_in.sum()), f"of {len(rows)} positions is", f"of {len(rows)} positions are")
     at = " and ".join(f"{first:g}, {second:g}" for first, second in places)
     suspicions.add(
         "place", str(rows.topic[0]),
-        seen=f"{int(is_fill_in.sum())} of {len(rows)} positions are at {at}, where none of the others could come from or go to",
+        seen=f"{found} at {at}, where none of the others could come from or go to",
         done="left out",
         setting=f'where in its [[extract.{role}]] (a condition that tells them), or extract.trusted = ["place"]',
     )  # fmt: skip

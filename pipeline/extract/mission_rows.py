@@ -9,6 +9,7 @@ from typing import Final
 import numpy as np
 
 from cadence.errors import InputError, NothingDetectedError
+from pipeline.counted import counted
 from pipeline.extract.channel_reader import ChannelReader
 from pipeline.extract.config import ExtractConfig
 from pipeline.extract.fill_ins import without_fill_ins
@@ -166,8 +167,9 @@ def _placed(role: str, rows: Positions, frame: Frame, counts: Counter[str], apar
         geodetic = {"latitude and longitude"} if (rows.is_geodetic & (not frame.is_georeferenced)).any() else set()
         apart |= geodetic | {str(name) for name in rows.frame_id[~rows.is_geodetic]} - {frame.frame_id, ""}
     if num_elsewhere and rows.is_stated.any():
+        found = counted(num_elsewhere, "position is", "positions are")
         raise InputError(
-            f"{role}: {num_elsewhere} positions are not in the mission frame {frame.frame_id!r}, and no transform of the log "
+            f"{role}: {found} not in the mission frame {frame.frame_id!r}, and no transform of the log "
             f"joins them; take those topics out of [[extract.{role}]]"
         )
     counts["other_frame"] += num_elsewhere

@@ -12,6 +12,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from cadence.arrays import Bools, Float64s, Int64s, Objects
+from pipeline.counted import counted
 from pipeline.extract.covariances import are_apart
 from pipeline.extract.positions import Positions
 from pipeline.suspicions import Suspicions, listed
@@ -200,4 +201,10 @@ def _is_shared(rows: Positions, tolerance_ns: int) -> Bools:
 
 def _suspect(topic: str, seen: str, num_false: int, suspicions: Suspicions) -> None:
     setting = "agent_path or has_identity (false: so be it, true: they are believed) in its [[extract.detections]]"
-    suspicions.add("identity", topic, seen=seen, done=f"{num_false} detections are of unknown origin", setting=setting)
+    suspicions.add(
+        "identity",
+        topic,
+        seen=seen,
+        done=f"{counted(num_false, 'detection is', 'detections are')} of unknown origin",
+        setting=setting,
+    )

@@ -11,6 +11,7 @@ from typing import Final
 import numpy as np
 
 from cadence.arrays import Int64s, Objects
+from pipeline.counted import counted
 from pipeline.extract.names import Naming
 from pipeline.extract.positions import Positions
 from pipeline.extract.tracks import Jump, Track, apart_m, odd_share, pieces_of
@@ -111,11 +112,11 @@ def _tell(topics: str, told: _Found, suspicions: Suspicions) -> None:
         suspicions.add("identity", topics, seen=seen, done="names of different sources are different agents", setting=_SETTING)
     if told.odd:
         seen = f"{listed(told.odd)} would be at several places at once, or leave and come back faster than anything moves"
-        done = f"{sum(told.odd.values())} detections are of unknown origin"
+        done = f"{counted(sum(told.odd.values()), 'detection is', 'detections are')} of unknown origin"
         suspicions.add("identity", topics, seen=seen, done=done, setting=_SETTING)
     if told.jumps:
         name, jump = max(told.jumps.items(), key=lambda item: item[1].ratio)
         far = f'"{name}" jumps {jump.length_m:.4g} m in {jump.time_s:.3g} s, {jump.ratio:.3g} times its speed'
-        more = f", and {len(told.jumps) - 1} more names jump" if len(told.jumps) > 1 else ""
-        done = f"{len(told.jumps)} names became {told.num_agents} agents ({name}, {name}.2, ...)"
+        more = f", and {counted(len(told.jumps) - 1, 'more name jumps', 'more names jump')}" if len(told.jumps) > 1 else ""
+        done = f"{counted(len(told.jumps), 'name')} became {counted(told.num_agents, 'agent')} ({name}, {name}.2, ...)"
         suspicions.add("identity", topics, seen=far + more, done=done, setting=_SETTING)

@@ -7,6 +7,7 @@ from typing import Final
 import numpy as np
 
 from cadence.arrays import Int64s
+from pipeline.counted import counted
 from pipeline.extract.channel_reader import ChannelReader
 from pipeline.extract.mission_clock import TRUSTED
 from pipeline.extract.positions import Positions
@@ -95,11 +96,12 @@ def without_unjoined(rows: Mapping[str, Positions], primary: str, suspicions: Su
     found = {role: each[np.searchsorted(edges_ns, each.time_ns, side="right") == kept] for role, each in rows.items()}
     num_lost = sum(len(each) - len(found[role]) for role, each in rows.items())
     first_ns, last_ns = int(found[primary].time_ns[0]), int(found[primary].time_ns[-1])
+    lost = counted(num_lost, "position outside is", "positions outside are")
     suspicions.add(
         "time", "the whole log",
         seen=f"{len(counts)} stretches of {', '.join(map(str, counts))} {primary} {why}, as where a clock is set during the "
         "recording",
-        done=f"only that from {utc(first_ns)} to {utc(last_ns)} is used, {num_lost} positions outside are left out",
+        done=f"only that from {utc(first_ns)} to {utc(last_ns)} is used, {lost} left out",
         setting=f"extract.start and extract.end choose another, {TRUSTED} takes all",
     )  # fmt: skip
     return found

@@ -19,6 +19,7 @@ from cadence.types import Evidence
 from pipeline.associations import AssociatedWindows, Sources, build_associated_windows, tell_sources
 from pipeline.catalogue import read_catalogue
 from pipeline.checkpoints import DEFAULT, checkpoint_hash, read_info
+from pipeline.counted import counted
 from pipeline.estimators.fit_test import FitTest, fit_test
 from pipeline.estimators.fitting import FittingData
 from pipeline.estimators.loaded import Loaded
@@ -139,7 +140,7 @@ def _tell_cost(num_windows: int, seconds: float, progress: Progress) -> None:
     """What is ahead, by what the first windows took, where one might wish to have fewer."""
     if seconds > _LONG_S:
         progress.note(
-            f"infer: {num_windows} windows, about {seconds / 60.0:.0f} min by the first ones; "
+            f"infer: {counted(num_windows, 'window')}, about {seconds / 60.0:.0f} min by the first ones; "
             "a larger infer.grid.stride_steps takes fewer"
         )
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from cadence.errors import CadenceError, ImplausibleInputError, InputError, PartialInputError, UsageError
+from pipeline.counted import counted
 from pipeline.extract.config import ExtractConfig
 from pipeline.extract.stage import write_tables
 from pipeline.ingest.stage import survey_channels
@@ -118,7 +119,9 @@ def exit_code(diagnoses: Sequence[Diagnosis]) -> int:
 
 def render(diagnosis: Diagnosis) -> str:
     """The diagnosis as text."""
-    doubt = f"; DOUBTFUL: {len(diagnosis.suspicions)} things in it can hardly be meant" if diagnosis.suspicions else ""
+    doubt = (
+        f"; DOUBTFUL: {counted(len(diagnosis.suspicions), 'thing')} in it can hardly be meant" if diagnosis.suspicions else ""
+    )
     lines = [f"{diagnosis.log}: {_MEANING[diagnosis.verdict]}{doubt}"]
     if diagnosis.verdict != "unusable" and not diagnosis.num_messages:
         lines.append("  no message was recorded")
@@ -180,13 +183,19 @@ def _use_lines(diagnosis: Diagnosis) -> list[str]:
     if diagnosis.no_use:
         return [f"nothing: {diagnosis.no_use}"]
     use = diagnosis.use
-    agents = f"{use['num_agents']} agent{'s' * (use['num_agents'] != 1)}" if use["num_agents"] else "agents that are not named"
-    counts = [f"{use['num_detections']} detections of {agents}{_topics(use, 'detections')}"]
+    agents = counted(use["num_agents"], "agent") if use["num_agents"] else "agents that are not named"
+    counts = [f"{counted(use['num_detections'], 'detection')} of {agents}{_topics(use, 'detections')}"]
     if use["num_unknown_origin"] and use["num_agents"]:
-        counts.append(f"{use['num_unknown_origin']} of them do not say which agent they are of")
+        counts.append(
+            counted(
+                use["num_unknown_origin"],
+                "of them does not say which agent it is of",
+                "of them do not say which agent they are of",
+            )
+        )
     for role, name, whose in (("truth", "num_truth", "the truth"), ("poses", "num_poses", "sensors")):
         if use[name]:
-            counts.append(f"{use[name]} positions of {whose}{_topics(use, role)}")
+            counts.append(f"{counted(use[name], 'position')} of {whose}{_topics(use, role)}")
     counts += [f"left out: {use[name]} {words}" for name, words in _LEFT_OUT.items() if use[name]]
     return counts + [f"not used, though it may hold detections: {channel}: {why}" for channel, why in use["unused"].items()]
 

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from pipeline.accuracies import lines
 from pipeline.catalogue import CatalogueChannel
+from pipeline.counted import counted
 from pipeline.ingest.stage import survey_channels
 from pipeline.inspect.doctor import use_of
 from pipeline.logs.parts import recorded_parts
@@ -89,7 +90,7 @@ def _head(description: LogDescription) -> list[str]:
     if description.health.num_messages:
         lines.append(f"  from      {utc(description.start_ns)}")
         lines.append(f"  to        {utc(description.end_ns)}  ({_duration(description.duration_s)})")
-    lines.append(f"  messages  {description.health.num_messages} on {len(description.channels)} channels")
+    lines.append(f"  messages  {description.health.num_messages} on {counted(len(description.channels), 'channel')}")
     if description.metadata_names:
         lines.append(f"  metadata  {', '.join(dict.fromkeys(description.metadata_names))}")
     return lines

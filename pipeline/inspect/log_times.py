@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from cadence.arrays import Int64s
+from pipeline.counted import counted
 from pipeline.logs.health import utc
 from pipeline.logs.reader import Batch, MissionLog
 
@@ -59,11 +60,13 @@ class _Clock:
         """What is odd about the channel."""
         found = []
         if self.num_backwards:
-            words = f"sequence numbers go backwards {self.num_backwards} times, first at {utc(self.first_backwards_ns)}"
+            times = counted(self.num_backwards, "time")
+            words = f"sequence numbers go backwards {times}, first at {utc(self.first_backwards_ns)}"
             found.append(f"{self.topic}: {words}: the clock was set back, or several publishers share the topic.")
         if self.jumps:
             when, change = self.jumps[0]
-            words = f"log time jumps against publish time {len(self.jumps)} times, first by {change:+.3g} s at {utc(when)}"
+            times = counted(len(self.jumps), "time")
+            words = f"log time jumps against publish time {times}, first by {change:+.3g} s at {utc(when)}"
             found.append(f"{self.topic}: {words}: one of the clocks was set, or messages were held up.")
         return found
 

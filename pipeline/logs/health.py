@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 
+from pipeline.counted import counted
 from pipeline.logs.plan import Loss, Plan
 
 _MAX_SENTENCES = 20
@@ -52,7 +53,8 @@ def _health_of(plan: Plan) -> Health:
     problems += plan.doubts[:_MAX_SENTENCES]
     if lost:
         ids = ", ".join(map(str, sorted(lost)))
-        problems.append(f"{sum(lost.values())} messages belong to channels without a definition (id {ids}) and cannot be used.")
+        whose = counted(sum(lost.values()), "message belongs", "messages belong")
+        problems.append(f"{whose} to channels without a definition (id {ids}) and cannot be used.")
     is_complete = not problems
     for number, channel in sorted(plan.channels.items()):
         if channel.schema_id and channel.schema_id not in plan.schemas:
@@ -95,5 +97,5 @@ def _sentence(loss: Loss) -> str:
     if loss.span_ns is not None:
         start, end = loss.span_ns
         span = f", {utc(start)} to {utc(end)} ({(end - start) / 1e9:.3g} s)"
-    count = "" if loss.num_messages is None else f", {loss.num_messages} messages"
+    count = "" if loss.num_messages is None else f", {counted(loss.num_messages, 'message')}"
     return f"Lost at byte {loss.offset}{span}{count}: {loss.reason}."

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 from mcap.records import Statistics
 
+from pipeline.counted import counted
 from pipeline.logs.chunk_checks import compare_chunks, leave_out_repeated
 from pipeline.logs.file_walk import FileWalk
 from pipeline.logs.plan import Plan
@@ -19,9 +20,11 @@ def judge(plan: Plan, tally: Tally, tail: Tail, walk: FileWalk, fault: str) -> N
     """
     _compare_end(plan, tail)
     if tally.num_timeless:
-        plan.doubts.append(f"{tally.num_timeless} messages have log times after the year 2262 and cannot be used.")
+        found = counted(tally.num_timeless, "message has a log time", "messages have log times")
+        plan.doubts.append(f"{found} after the year 2262 and cannot be used.")
     if tally.num_bad_indexes:
-        plan.remarks.append(f"{tally.num_bad_indexes} chunks differ from their message indexes, which were not used.")
+        found = counted(tally.num_bad_indexes, "chunk differs", "chunks differ")
+        plan.remarks.append(f"{found} from their message indexes, which were not used.")
     if plan.summary is None and tail.mark is not None:
         plan.summary = find_summary(walk.file, walk.begin, walk.end, tail.mark.end)
     plan.statistics = plan.summary.statistics if plan.summary is not None else _testimony(tail, walk)

@@ -173,9 +173,7 @@ def mission_obstacles(directory: Path) -> Obstacles | None:
     return obstacles if obstacles is not None and obstacles.count else None
 
 
-def collision_test(
-    obstacles: Obstacles | None, windows: MissionWindows, are_ways_straight: bool = True
-) -> IsInside | None:
+def collision_test(obstacles: Obstacles | None, windows: MissionWindows, are_ways_straight: bool = True) -> IsInside | None:
     """Which states touch an obstacle, themselves or on the straight way from the step before; None without obstacles.
 
     `are_ways_straight`: false of the truth, of which the way between two steps is not known.

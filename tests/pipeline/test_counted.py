@@ -1,0 +1,32 @@
+"""One agent, two agents."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from pipeline.counted import counted
+
+SOURCES = sorted((Path(__file__).resolve().parents[2] / "pipeline").rglob("*.py"))
+
+
+@pytest.mark.parametrize(
+    ("number", "words", "told"),
+    [
+        (0, ("agent",), "0 agents"),
+        (1, ("agent",), "1 agent"),
+        (2, ("agent",), "2 agents"),
+        (1, ("detection is", "detections are"), "1 detection is"),
+        (5, ("detection is", "detections are"), "5 detections are"),
+    ],
+)
+def test_what_follows_a_number_fits_it(number: int, words: tuple[str, ...], told: str) -> None:
+    assert counted(number, *words) == told
+
+
+def test_no_line_says_1_agents() -> None:
+    """What is told of agents, windows and the like goes through `counted`; numbers of the report's tables have commas."""
+    plain = re.compile(r"\{[^{}]*\} (?:more )?(?:agents|windows|names|things|targets|messages belong|detections (?:are|do))\b")
+    for path in SOURCES:
+        if "report" not in path.parts:
+            assert not plain.search(path.read_text(encoding="utf-8")), path
