@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Final, NoReturn
 
 from cadence.errors import CadenceError, InputError, UsageError
+from pipeline.counted import counted
 from pipeline.documents import parse_json
 from pipeline.logs.foreign import recordings_below
 from pipeline.logs.parts import LOG_ENDINGS, METADATA_NAME, group_parts, log_stem, mission_name, named_parts
@@ -47,7 +48,8 @@ def no_mission(path: Path) -> InputError:
         return InputError(f"{path}: is a file, not a mission directory; `cadence run {path} --out results` makes one of a log")
     inside = sorted(catalogue.parent for catalogue in path.glob(f"*/{CATALOGUE_NAME}"))
     if inside:
-        return InputError(f"{path}: holds {len(inside)} mission directories; name one, such as {inside[0]}")
+        held = counted(len(inside), "mission directory", "mission directories")
+        return InputError(f"{path}: holds {held}; name one, such as {inside[0]}")
     seen = f"holds no {CATALOGUE_NAME}, so it is no mission directory" if path.is_dir() else "not found"
     return InputError(f"{path}: {seen}; `cadence run LOG --out results` makes one, results/NAME")
 

@@ -10,7 +10,8 @@ from fixtures.line_logs import Fix, straight_line, write_log
 
 import cli
 
-FAST = ["--set", "infer.checkpoint=none", "--set", "infer.num_hypotheses=4", "--set", "infer.grid.stride_steps=64", "--quiet"]
+GRID = ["--set", "infer.grid.history_steps=16", "--set", "infer.grid.horizon_steps=8", "--set", "infer.grid.stride_steps=16"]
+FAST = ["--set", "infer.checkpoint=none", "--set", "infer.num_hypotheses=4", *GRID, "--quiet"]
 STAGE_FILES = {
     "ingest": {"catalogue.json"},
     "extract": {"detections.parquet", "truth.parquet", "poses.parquet", "obstacles.json"},

@@ -18,7 +18,8 @@ from pipeline.progress import Progress
 
 ROOT = Path(__file__).resolve().parents[1]
 SHIPPED = sorted((ROOT / "cadence" / "checkpoints").glob("*.safetensors"))
-SMALL = ["--set", "infer.num_hypotheses=5", "--set", "infer.grid.stride_steps=32", "--json", "--quiet"]
+GRID = ["--set", "infer.grid.history_steps=16", "--set", "infer.grid.horizon_steps=8", "--set", "infer.grid.stride_steps=16"]
+SMALL = ["--set", "infer.num_hypotheses=5", *GRID, "--json", "--quiet"]
 BANK = ["--set", "infer.checkpoint=none"]
 TABLES = ("detections.parquet", "hypotheses.parquet", "windows.parquet")
 RESULTS = (*TABLES, "walk.cadence.mcap", "walk.layout.json", "report.html")
@@ -79,7 +80,7 @@ def test_same_seed_same_bytes_other_seed_other_hypotheses(log, tmp_path, capsys)
 def test_stages_one_by_one_give_what_run_gives(log, tmp_path, capsys):
     run(capsys, log, tmp_path / "run", *BANK)
     mission = str(tmp_path / "single" / "walk")
-    settings = ["--quiet", *SMALL[:4], *BANK]
+    settings = ["--quiet", *SMALL[:-2], *BANK]
     assert cli.main(["ingest", str(log), "--out", str(tmp_path / "single"), "-q"]) == 0
     for command in ("extract", "infer", "export", "report"):
         assert cli.main([command, mission, *settings]) == 0
@@ -102,14 +103,15 @@ def test_a_run_hashes_the_log_once(log, tmp_path, capsys, monkeypatch):
 
 
 def test_every_stage_makes_the_same_of_its_declared_inputs_alone(tmp_path, capsys):
-    simulate = ["simulate", "--out", str(tmp_path / "logs"), "--set", "simulate.patrol.duration_s=900", "--json", "-q"]
+    simulate = ["simulate", "--out", str(tmp_path / "logs"), "--set", "simulate.patrol.duration_s=600", "--json", "-q"]
     assert cli.main(simulate) == 0
     (log,) = json.loads(capsys.readouterr().out)["outputs"]
     grid = ["--set", "infer.grid.step_s=5", "--set", "infer.grid.context_steps=160"]  # of which evaluate hears from infer
-    settings = [*BANK, *SMALL[:4], *grid, "--quiet"]
+    settings = [*BANK, *SMALL[:-2], *grid, "--quiet"]
     assert cli.main(["run", log, "--out", str(tmp_path / "out"), *settings]) == 0
     mission = tmp_path / "out" / Path(log).stem
-    evaluate(mission, EvaluateConfig(num_resamples=20), Progress(quiet=True))
+    scoring = EvaluateConfig(rivals=("linear", "hold"), num_resamples=20)  # rivals that cost nothing to fit
+    evaluate(mission, scoring, Progress(quiet=True))
     for stage in ("extract", "infer", "export", "report", "evaluate"):
         manifest = json.loads((mission / f"{stage}.manifest.json").read_text())
         alone = tmp_path / stage / mission.name
@@ -118,7 +120,7 @@ def test_every_stage_makes_the_same_of_its_declared_inputs_alone(tmp_path, capsy
             if (mission / name).is_file():  # others belong to the program
                 shutil.copy(mission / name, alone / name)
         if stage == "evaluate":
-            evaluate(alone, EvaluateConfig(num_resamples=20), Progress(quiet=True))
+            evaluate(alone, scoring, Progress(quiet=True))
         else:
             assert cli.main([stage, str(alone), *settings]) == 0
         made = json.loads((alone / f"{stage}.manifest.json").read_text())
@@ -144,10 +146,11 @@ def test_shipped_checkpoint_is_the_default(log, tmp_path, capsys):
 
 
 def test_simulated_mission_can_be_scored(tmp_path, capsys):
-    simulate = ["simulate", "--out", str(tmp_path / "logs"), "--seed", "5", "--set", "simulate.patrol.duration_s=1200"]
+    simulate = ["simulate", "--out", str(tmp_path / "logs"), "--seed", "5", "--set", "simulate.patrol.duration_s=600"]
     assert cli.main([*simulate, "--set", "simulate.patrol.detection_rate=0.3", "--json", "-q"]) == 0
     (log,) = json.loads(capsys.readouterr().out)["outputs"]
     run(capsys, Path(log), tmp_path / "out", *BANK, "--set", "infer.guidance.mode=none", "--set", "infer.grid.step_s=10")
-    assert cli.main(["evaluate", str(tmp_path / "out" / Path(log).stem), "-q", "--set", "evaluate.num_resamples=20"]) == 0
+    scoring = ["--set", "evaluate.num_resamples=20", "--set", 'evaluate.rivals=["cv", "hold"]']
+    assert cli.main(["evaluate", str(tmp_path / "out" / Path(log).stem), "-q", *scoring]) == 0
     assert "cadence" in capsys.readouterr().out
     assert (tmp_path / "out" / Path(log).stem / "scores.md").read_text().startswith("# Scores")

@@ -35,11 +35,7 @@ FLOORS = {
         {"training"},
     ),
     "pipeline": (
-<<<<<<< HEAD
-        {"clock", "documents", "lengths", "moments", "out_of_memory", "suggestions"},
-=======
-        {"counted", "documents", "out_of_memory", "suggestions"},
->>>>>>> 798aeeb (pipeline: one agent, two agents: numbers fit their nouns)
+        {"clock", "counted", "documents", "lengths", "moments", "out_of_memory", "suggestions"},
         {
             "accuracies",
             "arrays",
@@ -129,13 +125,13 @@ def circle_of(arrows: dict[str, set[str]]) -> list[str]:
     return []
 
 
-def every_source(test):
-    return pytest.mark.parametrize("path", SOURCES, ids=name_of)(test)
+def found_in_sources(rule) -> dict[str, object]:
+    """What a rule of a name and a tree finds, by file: one test a rule, since one a file costs more than all files."""
+    return {name_of(path): found for path in SOURCES if (found := rule(name_of(path), tree_of(path)))}
 
 
-@every_source
-def test_imports_point_downwards(path):
-    assert not wrong_imports(name_of(path), tree_of(path))
+def test_imports_point_downwards():
+    assert not found_in_sources(wrong_imports)
 
 
 @pytest.fixture(scope="module")
@@ -168,19 +164,17 @@ def test_planted_offences_against_the_order_are_caught():
     assert set(circle_of(arrows)) == {"pipeline.infer.stage", "pipeline.windows"}
 
 
-@every_source
-def test_nothing_that_the_house_does_without(path):
-    assert not unwanted(name_of(path), tree_of(path))
+def test_nothing_that_the_house_does_without():
+    assert not found_in_sources(unwanted)
 
 
-@every_source
-def test_no_global_random_state(path):
-    assert not global_randomness(name_of(path), tree_of(path))
+def test_no_global_random_state():
+    assert not found_in_sources(global_randomness)
 
 
-@every_source
-def test_files_and_functions_stay_readable(path):
-    assert not too_long(name_of(path), path.read_text(encoding="utf-8"))
+def test_files_and_functions_stay_readable():
+    long = {name_of(path): too_long(name_of(path), path.read_text(encoding="utf-8")) for path in SOURCES}
+    assert not {name: found for name, found in long.items() if found}
 
 
 def test_exceptions_from_the_limits_are_needed():

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from cadence.worlds.patrol import PatrolConfig
 from pipeline.progress import Progress
 from pipeline.simulate.stage import SimulateConfig, simulate
 
@@ -14,7 +15,7 @@ EXAMPLES = re.findall(r"^```python\n(.*?)^```", PAGE.read_text(encoding="utf-8")
 
 def test_examples_of_the_page_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     logs = tmp_path / "logs"
-    simulate(logs, SimulateConfig(seed=13), Progress(quiet=True))
+    simulate(logs, SimulateConfig(seed=13, patrol=PatrolConfig(duration_s=1200.0)), Progress(quiet=True))
     (log,) = logs.glob("*.mcap")
     log.rename(logs / "patrol.mcap")
     monkeypatch.chdir(tmp_path)

@@ -13,6 +13,7 @@ import numpy as np
 from cadence.arrays import Float64s, Int64s
 from cadence.measurement.noise import MeasurementNoise, Track, covariances_m2, measurement_noise, roughness_m
 from pipeline.accuracies import Accuracy
+from pipeline.counted import counted
 from pipeline.extract.one_target import is_one_target
 from pipeline.extract.positions import Positions
 from pipeline.suspicions import Suspicions
@@ -25,6 +26,9 @@ _MIN_VAGUE_M: Final = 100.0
 _VAGUE_RATIO: Final = 1000.0
 """Smoothed positions scatter less than they are off, by a hundred times at most; by a thousand where a driver writes 1e6 m²."""
 _SURE_RATIO: Final = 10.0
+_LEAST_M: Final = 1e-3
+_ABSURD_RATIO: Final = 1000.0
+"""A receiver that has just resolved its ambiguities claims to be some hundred times as exact as before, never below this."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +58,7 @@ def with_accuracy(
     sources = [source for source in _sources(rows, kinds) if rows.topic[source.rows[0]] not in told_topics]
     if suspicions.looks_for("covariance"):
         for source in sources:
+            _mend_absurd(source, covariance, suspicions)
             stated = source.rows[~np.isnan(covariance[source.rows, 0])]
             if _is_contradicted(source, covariance[stated], suspicions):
                 covariance[stated] = np.nan
@@ -82,6 +87,26 @@ def _noises(sources: Sequence[_Source]) -> list[tuple[list[_Source], Measurement
         else:
             weak.setdefault(source.kind, []).append(source)
     return found + [(group, measurement_noise([way for source in group for way in source.ways])) for group in weak.values()]
+
+
+def _mend_absurd(source: _Source, covariance_m2: Float64s, suspicions: Suspicions) -> None:
+    """Give the few rows of a source that claim to be a thousand times as exact as the others the others' covariance [N, 3]."""
+    stated = source.rows[~np.isnan(covariance_m2[source.rows, 0])]
+    if not len(stated):
+        return
+    sigma_m = np.sqrt(covariance_m2[stated][:, [0, 2]].min(axis=1))
+    usual_m = float(np.median(sigma_m))
+    is_absurd = (sigma_m < _LEAST_M) & (sigma_m < usual_m / _ABSURD_RATIO)
+    if not is_absurd.any():
+        return
+    covariance_m2[stated[is_absurd]] = np.median(covariance_m2[stated[~is_absurd]], axis=0)
+    number = int(is_absurd.sum())
+    states = counted(number, f"of {len(stated)} detections states", f"of {len(stated)} detections state")
+    suspicions.add(
+        "covariance", source.name,
+        seen=f"{states} a standard deviation of {sigma_m[is_absurd].max():.2g} m at most, the others {usual_m:.3g} m",
+        done="taken as exact as the others", setting='extract.trusted = ["covariance"]',
+    )  # fmt: skip
 
 
 def _is_contradicted(source: _Source, covariance_m2: Float64s, suspicions: Suspicions) -> bool:

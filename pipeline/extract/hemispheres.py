@@ -1,6 +1,7 @@
 """Sources in degrees that contradict each other: one has latitude and longitude exchanged, or lost a sign.
 
-Alone such positions look as sound as any others; beside the other sources of the log they lie where these would, mirrored.
+Alone such positions look as sound as any others, unless a latitude lies beyond the poles; beside the other sources of the log,
+or a datum that the user states, they lie where these would, mirrored.
 """
 
 from collections.abc import Mapping, Sequence
@@ -17,6 +18,7 @@ Mirrored = Literal["exchanged", "other side of Greenwich", "other side of the eq
 _NEAR_DEG: Final = 1.0
 _FAR_DEG: Final = 5.0
 _MAX_ROWS: Final = 2048
+_DATUM: Final = "extract.datum"
 _MAX_SOURCES: Final = 12
 """Of many that are spread over the earth some are each other's mirror images by chance."""
 _MIRRORS: Final[Mapping[Mirrored, tuple[tuple[int, int], tuple[int, int]]]] = {  # which coordinates, with which signs
@@ -29,20 +31,24 @@ _MIRRORS: Final[Mapping[Mirrored, tuple[tuple[int, int], tuple[int, int]]]] = { 
 Sources = Mapping[str, Sequence[tuple[ChannelReader, Positions]]]
 
 
-def check_hemispheres(parts: Sources, suspicions: Suspicions) -> None:
-    """Tell of sources, by role, that lie far from all others, but near them when mirrored; which are right nobody knows."""
+def check_hemispheres(parts: Sources, datum: tuple[float, float] | None, suspicions: Suspicions) -> None:
+    """Tell of sources, by role, that lie far from all others, but near them when mirrored; which are right nobody knows.
+
+    A datum that the user stated is one more place, and the one that all are compared with.
+    """
     sources = {
         reader.channel.topic: rows
         for found in parts.values()
         for reader, rows in found
         if len(rows) and rows.is_geodetic.all() and reader.source.unit is None and np.isfinite(rows.first + rows.second).any()
     }
-    if not 1 < len(sources) <= _MAX_SOURCES or not suspicions.looks_for("place"):
+    known = {} if datum is None else {_DATUM: np.array(datum)}
+    if not 1 < len(sources) + len(known) <= _MAX_SOURCES or not suspicions.looks_for("place"):
         return
     places = {topic: _place(rows) for topic, rows in sources.items()}
     told: set[str] = set()
     for topic, place in places.items():
-        others = {name: there for name, there in places.items() if name != topic}
+        others = known or {name: there for name, there in places.items() if name != topic}
         if any(_apart_deg(place, there) < _FAR_DEG for there in others.values()):
             continue
         for mirrored, (order, signs) in _MIRRORS.items():
@@ -66,10 +72,11 @@ def _apart_deg(one: np.ndarray, other: np.ndarray) -> float:
 
 
 def _tell(topic: str, place: np.ndarray, mirrored: Mirrored, near: Sequence[str], suspicions: Suspicions) -> None:
+    where = "its source" if _DATUM in near else "both sources"
     word = "latitude and longitude exchanged" if mirrored == "exchanged" else f"it on the {mirrored}"
     suspicions.add(
         "place", topic,
         seen=f"it lies about {place[0]:.4g}, {place[1]:.4g}, and with {word} it would lie near {', '.join(near[:3])}",
         done="used as it stands",
-        setting='latitude and longitude (also "PATH.@negative"), or unit = "deg", in both sources',
+        setting=f'latitude and longitude (also "PATH.@negative"), or unit = "deg", in {where}',
     )  # fmt: skip

@@ -28,6 +28,7 @@ from pipeline.extract.thinning import ThinningConfig, is_seen, noise
 from pipeline.extract.transform_messages import LogTransforms
 from pipeline.extract.transforms import Limits
 from pipeline.extract.units import in_true_units
+from pipeline.extract.writing_order import without_set_back_unnumbered
 from pipeline.logs.health import utc
 from pipeline.logs.reader import MissionLog
 from pipeline.suspicions import Suspicions, few
@@ -45,11 +46,14 @@ def rows_in_frame(
     transforms: LogTransforms,
 ) -> tuple[dict[str, Positions], Frame]:  # fmt: skip
     """The rows of every role, placed in the mission frame and thinned, and that frame."""
-    parts = {role: _numbered([(reader, reader.finish()) for reader in readers if reader.role == role]) for role in ROLES}
+    parts = {role: [(reader, reader.finish()) for reader in readers if reader.role == role] for role in ROLES}
     parts = without_set_back(parts, suspicions)
+    if counts["steps_back"] and config.start is None and config.end is None:
+        parts = without_set_back_unnumbered(parts, log, suspicions)
+    parts = {role: _numbered(found) for role, found in parts.items()}
     timed, clock = on_one_clock(parts, suspicions)
     placed = {role: _in_place(role, parts[role], timed[role], suspicions) for role in ROLES}
-    check_hemispheres(placed, suspicions)
+    check_hemispheres(placed, config.datum, suspicions)
     rows = {role: _columns([each for _, each in placed[role]], counts) for role in ROLES}
     primary = "truth" if config.thinning.enabled and config.thinning.thin_from == "truth" else "detections"
     _check_any(primary, rows[primary], counts, suspicions)

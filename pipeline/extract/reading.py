@@ -28,6 +28,8 @@ def read_positions(
 ) -> Counter[str]:
     """Feed the messages of the readers' channels with start_ns <= log time < end_ns to them; counts of what was not used.
 
+    `steps_back` counts how often messages turned out not to have been written by time.
+
     Raises `InputError` as soon as there are more than `max_detections`: before anything is read where the log says so.
     """
     counts: Counter[str] = Counter()
@@ -56,7 +58,7 @@ def read_positions(
         bar.update(num_bytes)
 
     with progress.bar(log.size_bytes, "extract", unit="B", scale=True) as bar:
-        for raw in log.messages(topics, advance, start_ns, end_ns):
+        for raw in log.messages(topics, advance, start_ns, end_ns, lambda: counts.update(steps_back=1)):
             feed = feeds.get(raw.channel.id)
             if feed is not None:
                 feed.add(raw)

@@ -140,8 +140,14 @@ def _move_on(tracks: Sequence[Positions], edge_ns: int) -> bool:
 
 
 def _moves_on(track: Positions, edge_ns: int) -> bool | None:
-    """`_move_on` of one track; None where it has too few rows, no steady beat, or does not go straight on."""
-    after = int(np.searchsorted(track.time_ns, edge_ns))
+    return moves_on(track, int(np.searchsorted(track.time_ns, edge_ns)))
+
+
+def moves_on(track: Positions, after: int) -> bool | None:
+    """Whether a target was, at the row `after`, one step further than before, whatever the times say that passed there.
+
+    None where its track has too few rows, no steady beat, or does not go straight on.
+    """
     if not _COURSE_ROWS <= after <= len(track) - _COURSE_ROWS:
         return None
     place, time_s = track.first + 1j * track.second, (track.time_ns - track.time_ns[0]) * 1e-9

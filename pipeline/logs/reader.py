@@ -8,6 +8,7 @@ from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from cadence.arrays import Int64s
 from cadence.errors import InputError
 from pipeline.logs.channels import Batch as Batch
 from pipeline.logs.channels import Channel as Channel
@@ -68,14 +69,19 @@ class MissionLog:
         on_bytes: OnBytes | None = None,
         start_ns: int | None = None,
         end_ns: int | None = None,
+        on_back: Callable[[], object] | None = None,
     ) -> Iterator[RawMessage]:
         """All messages of `topics` (None: of every topic) in log-time order, then in the order of the files.
 
         Only those with start_ns <= log time < end_ns, where these are given; other chunks are not read. Memory: one
         chunk, and a bounded part of those that overlap it in time. `on_bytes` is called with the number of bytes done
-        since the last call; the calls add up to `size_bytes`.
+        since the last call; the calls add up to `size_bytes`. `on_back` is called where they were not written by time.
         """
-        return self._timeline(topics, on_bytes, start_ns, end_ns).messages()
+        return self._timeline(topics, on_bytes, start_ns, end_ns, on_back).messages()
+
+    def written(self, topics: Collection[str] | None = None) -> tuple[Int64s, Int64s]:
+        """Channel id [N] and log time [N] of all messages of `topics` in the order in which they were written."""
+        return self._timeline(topics, None, None, None).written()
 
     def batches(
         self,
@@ -102,7 +108,12 @@ class MissionLog:
         return tuple(found)
 
     def _timeline(
-        self, topics: Collection[str] | None, on_bytes: OnBytes | None, start_ns: int | None, end_ns: int | None
+        self,
+        topics: Collection[str] | None,
+        on_bytes: OnBytes | None,
+        start_ns: int | None,
+        end_ns: int | None,
+        on_back: Callable[[], object] | None = None,
     ) -> Timeline:
         wanted = [
             {number: channel for number, channel in source.channels.items() if topics is None or channel.topic in topics}
@@ -110,7 +121,7 @@ class MissionLog:
         ]
         start = 0 if start_ns is None else max(0, start_ns)
         end = MAX_TIME_NS + 1 if end_ns is None else max(0, min(end_ns, MAX_TIME_NS + 1))
-        return Timeline(self._sources, Selection(wanted, start, end), on_bytes)
+        return Timeline(self._sources, Selection(wanted, start, end), on_bytes, on_back)
 
 
 def open_log(path: Path | str, on_bytes: OnBytes | None = None) -> MissionLog:

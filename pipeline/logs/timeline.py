@@ -5,6 +5,7 @@ arrays of places. Where many blocks overlap, their bytes are not all held but re
 """
 
 import contextlib
+import itertools
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -30,6 +31,8 @@ from pipeline.logs.records import (
 )
 from pipeline.logs.rows import Rows, indexed_rows, rows_by_walk, rows_in_torn
 
+BACK_NS: Final = 10**9
+"""Recorders that write what comes from several places are out of order by less."""
 MAX_HELD_BYTES: Final = 2**27
 """So many bytes of unpacked blocks, and of messages that wait for each other, are held where blocks overlap."""
 
@@ -81,15 +84,46 @@ class _Piece:
 class Timeline:
     """One pass over the selected messages of `sources`."""
 
-    def __init__(self, sources: Sequence[Source], selection: Selection, on_bytes: Callable[[int], object] | None) -> None:
-        self.sources, self.selection, self.on_bytes = sources, selection, on_bytes
+    def __init__(
+        self,
+        sources: Sequence[Source],
+        selection: Selection,
+        on_bytes: Callable[[int], object] | None,
+        on_back: Callable[[], object] | None = None,
+    ) -> None:
+        self.sources, self.selection, self.on_bytes, self.on_back = sources, selection, on_bytes, on_back
         self.held: dict[tuple[int, int], bytes] = {}  # unpacked blocks, the one used last at the end
         places = [(block.start_ns, number, block.offset, block) for number, part in enumerate(sources) for block in part.blocks]
         self.places = sorted(places, key=lambda place: place[:3])
 
     def messages(self) -> Iterator[RawMessage]:
-        """All messages by log time; those of one time in the order of the sources and of the file."""
+        """All messages by log time; those of one time in the order of the sources and of the file.
+
+        `on_back` is called where they were not written by time: where one lies over `BACK_NS` before what was written earlier.
+        """
+        self._tell_back()
         return chain.from_iterable(self._stretches())
+
+    def written(self) -> tuple[Int64s, Int64s]:
+        """Channel [N] and log time [N] of the messages in the order in which they were written."""
+        found = []
+        for number, block, loaded in self._blocks():
+            if loaded is not None:
+                rows = loaded[1][np.argsort(loaded[1].begin, kind="stable")]
+                ids = {own: channel.id for own, channel in self.sources[number].channels.items()}
+                channel = np.fromiter(map(ids.__getitem__, rows.channel_id.tolist()), np.int64, len(rows))
+                found.append(((number, block.offset), channel, rows.log_time_ns.astype(np.int64)))
+        found.sort(key=lambda part: part[0])
+        none = np.zeros(0, np.int64)
+        return np.concatenate([none, *(part[1] for part in found)]), np.concatenate([none, *(part[2] for part in found)])
+
+    def _tell_back(self) -> None:
+        """Whether blocks overlap, as the files have them."""
+        blocks = [block for number, part in enumerate(self.sources) for block in part.blocks if self._is_wanted(number, block)]
+        if self.on_back is not None and any(
+            later.start_ns < earlier.end_ns - BACK_NS for earlier, later in itertools.pairwise(blocks)
+        ):
+            self.on_back()
 
     def _stretches(self) -> Iterator[Iterable[RawMessage]]:
         waiting: list[_Piece] = []
@@ -148,7 +182,11 @@ class Timeline:
         else:
             rows = indexed_rows(data, index, wanted.keys())
         is_in_time = (rows.log_time_ns >= self.selection.start_ns) & (rows.log_time_ns < np.uint64(self.selection.end_ns))
-        return data, (rows if is_in_time.all() else rows[is_in_time]).by_time()
+        rows = rows if is_in_time.all() else rows[is_in_time]
+        ordered = rows.by_time()
+        if ordered is not rows and self.on_back is not None and _steps_back(rows):
+            self.on_back()
+        return data, ordered
 
     def _hold(self, key: tuple[int, int], data: bytes) -> None:
         """Keep the bytes of a block for a while, and forget those that have not been used for the longest time."""
@@ -194,6 +232,10 @@ class Timeline:
             messages = raw_messages(channels, self._bytes(pieces[number]), rows[stretch[places]])
             found += zip(places.tolist(), messages, strict=True)
         return [message for _, message in sorted(found, key=lambda item: item[0])]
+
+
+def _steps_back(rows: Rows) -> bool:
+    return bool((np.diff(rows.log_time_ns.astype(np.int64)) < -BACK_NS).any())
 
 
 def read_span(file: BinaryIO, offset: int, length: int) -> bytes:

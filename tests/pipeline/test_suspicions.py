@@ -18,7 +18,8 @@ from pipeline.suspicions import Suspicion, Suspicions, few, suspicions_in
 QUIET = Progress(quiet=True)
 TINY = [
     "--set", "infer.checkpoint=none", "--set", "infer.num_hypotheses=2", "--set", "infer.association.num_particles=8",
-    "--set", "infer.grid.stride_steps=64", "--set", "infer.association.num_agents=2", "--quiet",
+    "--set", "infer.grid.stride_steps=16", "--set", "infer.association.num_agents=2", "--quiet",
+    "--set", "infer.grid.history_steps=16", "--set", "infer.grid.horizon_steps=8",
 ]  # fmt: skip
 SENTENCE = 'identity of /fixes: 12 of 12 messages have "T" at several places; 24 detections are of unknown origin'
 
@@ -66,7 +67,7 @@ def test_every_command_tells_it_and_leaves_with_8(log: Path, tmp_path: Path, cap
     assert main(["extract", str(out / "shared"), "--quiet"]) == 8 and SENTENCE in capsys.readouterr().out
     assert main(["doctor", str(log), "--quiet"]) == 8
     told = capsys.readouterr().out
-    assert "SOUND; DOUBTFUL: 1 things" in told and f"What is suspected:\n  {SENTENCE}" in told
+    assert "SOUND; DOUBTFUL: 1 thing" in told and f"What is suspected:\n  {SENTENCE}" in told
 
 
 def test_strict_refuses_and_leaves_nothing(log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

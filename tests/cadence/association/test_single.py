@@ -28,13 +28,13 @@ def test_bursts_of_one_target_are_one_targets() -> None:
 @pytest.mark.parametrize(("num_agents", "share"), [(1, 0.8), (2, 0.0), (4, 0.0)])
 def test_patrols_of_one_smuggler_are_told_from_those_of_several(num_agents: int, share: float) -> None:
     found = []
-    for seed in range(12):
+    for seed in range(7):
         episode = simulate_patrol(PatrolConfig(num_agents=num_agents), np.random.default_rng(seed))
         seen = episode.detections
         if len(seen) > 20 and len(set(seen.agent.tolist())) == num_agents:
             both = Stream(episode.time_s[seen.step], seen.position_m, seen.covariance_m2)
             found.append(is_one_target(both))
-    assert len(found) >= 6
+    assert len(found) >= 4
     assert np.mean(found) >= share if num_agents == 1 else not any(found)
 
 

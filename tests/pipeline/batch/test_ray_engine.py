@@ -20,7 +20,18 @@ from pipeline.batch.tasks import plan_tasks, run_task, run_tasks
 from pipeline.config import stage_config
 
 pytestmark = pytest.mark.timeout(600)  # Ray takes seconds to start, and many where the machine is busy
-CONFIG = stage_config(RunConfig, None, None, ["infer.checkpoint=none", "infer.num_hypotheses=3", "infer.grid.stride_steps=64"])
+CONFIG = stage_config(
+    RunConfig,
+    None,
+    None,
+    [
+        "infer.checkpoint=none",
+        "infer.num_hypotheses=3",
+        "infer.grid.stride_steps=16",
+        "infer.grid.history_steps=16",
+        "infer.grid.horizon_steps=8",
+    ],
+)
 
 
 @pytest.fixture(scope="module")

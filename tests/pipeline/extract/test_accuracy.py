@@ -139,3 +139,37 @@ def test_one_agents_numbers_do_not_touch_anothers(tmp_path: Path) -> None:
     alone = run(tmp_path, sound).detections.drop(["sequence"])
     of_all = found.detections.drop(["sequence"]).filter([name == "d" for name in found.detections["agent_id"].to_pylist()])
     assert of_all.to_pydict() == alone.to_pydict()
+
+
+def mixed(few_m2: float, many_m2: float, num_few: int = 5) -> list[Row]:
+    """A target with noise of 5 m whose detections state one of two covariances."""
+    found = rows(STRAIGHT + noise(5.0), "a", many_m2)
+    found[7 : 7 * (num_few + 1) : 7] = rows(STRAIGHT + noise(5.0), "a", few_m2)[7 : 7 * (num_few + 1) : 7]
+    return found
+
+
+def test_a_few_absurdly_exact_detections_are_as_exact_as_the_others(tmp_path: Path) -> None:
+    found = run(tmp_path, mixed(1e-12, 25.0))
+    (suspicion,) = found.summary["suspicions"]
+    assert suspicion["kind"] == "covariance" and suspicion["done"] == "taken as exact as the others"
+    assert suspicion["seen"] == "5 of 240 detections state a standard deviation of 1e-06 m at most, the others 5 m"
+    assert set(found.detections["cov_xx_m2"].to_pylist()) == {25.0}
+    trusting = run(tmp_path, mixed(1e-12, 25.0), trusted=["covariance"])
+    assert trusting.summary["suspicions"] == [] and trusting.detections["cov_xx_m2"].to_pylist().count(1e-12) == 5
+
+
+@pytest.mark.parametrize(
+    ("few_m2", "many_m2", "num_few"), [(1e-4, 25.0, 20), (0.01, 25.0, 5), (1e-8, 1e-8, 5), (1e-8, 1e-6, 5)]
+)
+def test_detections_that_are_really_more_exact_are_left_as_they_are(
+    tmp_path: Path, few_m2: float, many_m2: float, num_few: int
+) -> None:
+    """A receiver that gets a fix now and then, and a room with cameras."""
+    exact = [
+        detection(row, *place, agent_id="a", covariance=[each, 0.0, 0.0, each])
+        for row, place, each in zip(
+            SECONDS.tolist(), STRAIGHT.tolist(), [few_m2 if i % 12 == 0 and i < 12 * num_few else many_m2 for i in range(240)],
+            strict=True,
+        )
+    ]  # fmt: skip
+    assert not [s for s in run(tmp_path, exact).summary["suspicions"] if "as exact as the others" in s["done"]]

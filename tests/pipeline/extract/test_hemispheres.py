@@ -33,3 +33,14 @@ def test_one_source_that_is_mirrored(tmp_path: Path, place: tuple[float, float],
 def test_sources_that_are_far_apart_or_near(tmp_path: Path, place: tuple[float, float]) -> None:
     beside = (48.1, 11.6) if abs(place[0]) > 1 else (0.1, 0.1)
     assert run(tmp_path, [*contacts("a", *beside), *contacts("b", *place)]).summary["suspicions"] == []
+
+
+def test_the_only_source_beside_a_datum_that_is_stated(tmp_path: Path) -> None:
+    rows = contacts("a", 11.6, 48.1)
+    (suspicion,) = run(tmp_path, rows, datum=(48.2, 11.5)).summary["suspicions"]
+    assert "with latitude and longitude exchanged it would lie near extract.datum" in suspicion["seen"]
+    assert suspicion["setting"].endswith("in its source")
+    assert run(tmp_path, rows, datum=(11.5, 48.2)).summary["suspicions"] == []
+    assert run(tmp_path, rows).summary["suspicions"] == []  # alone it looks as sound as any
+    both = [*rows, *contacts("b", 11.7, 48.0)]
+    assert len(run(tmp_path, both, datum=(48.2, 11.5)).summary["suspicions"]) == 2

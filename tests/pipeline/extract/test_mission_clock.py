@@ -183,3 +183,28 @@ def test_twenty_channels_are_judged_by_themselves(tmp_path: Path) -> None:
     rows = [each for i in range(20) for each in contacts(f"A{i}", -7200.0 if i == 7 else 0.0, num=5)]
     found = run(tmp_path, write_log(tmp_path / "many.mcap", sorted(rows, key=lambda each: each.time_s)))
     assert len(suspected(found)) == 1 and "/contacts/A7" in suspected(found)[0]
+
+
+@pytest.mark.parametrize("chunk_bytes", [500, 16_384])
+@pytest.mark.parametrize("back_s", [3600.0, 3.5])
+def test_a_clock_that_is_set_back_where_messages_are_not_numbered(tmp_path: Path, back_s: float, chunk_bytes: int) -> None:
+    """The order in which they were written tells, as rosbag2 numbers nothing."""
+    both = sorted([*contacts("A", num=40, late_s=0.0), *contacts("B", num=40, late_s=0.0)], key=lambda each: each.time_s)
+    log = write_log(tmp_path / "log.mcap", [*shifted(both[:20], back_s), *both[20:]], False, chunk_bytes)
+    found = run(tmp_path, log)
+    assert seconds(found) == [float(i) for i in range(10, 40)] == seconds(found, "B")
+    (told,) = found.summary["suspicions"]
+    assert f"step back 1 time in the order in which messages were written, by {back_s - 1:.3g} s" in told["seen"]
+    assert "20 positions in others are left out" in told["done"] and "extract.start" in told["setting"]
+    assert suspected(run(tmp_path, log, trusted=["time"])) == []
+
+
+def test_messages_that_are_sorted_in_another_way_were_not_set_back(tmp_path: Path) -> None:
+    """One target after the other, one of them in two halves, and every message a little late."""
+    targets = {name: contacts(name, num=40, late_s=0.0) for name in "AB"}
+    for rows in (
+        [*targets["A"], *targets["B"]],
+        [*targets["A"][20:], *targets["A"][:20], *targets["B"]],
+        [each for pair in zip(targets["A"], targets["B"], strict=True) for each in shifted(list(pair), 0.0)[::-1]],
+    ):
+        assert suspected(run(tmp_path, write_log(tmp_path / "log.mcap", rows, False))) == []

@@ -202,7 +202,7 @@ def test_numbers_that_begin_again_are_no_clock(examined: Callable[[bytes], Diagn
 def test_a_jump_between_log_and_publish_time_is_named(examined: Callable[[bytes], Diagnosis]) -> None:
     times = [(i + 100.0 * (i >= 25), float(i), i) for i in range(50)]
     (remark,) = examined(recorded(times)).clocks
-    assert "jumps against publish time 1 times, first by +100 s" in remark
+    assert "jumps against publish time 1 time, first by +100 s" in remark
 
 
 def test_a_clock_is_watched_over_chunks(examined: Callable[[bytes], Diagnosis]) -> None:
