@@ -7,6 +7,7 @@ from typing import Final
 import numpy as np
 
 from cadence.errors import InputError
+from pipeline.counted import told
 from pipeline.extract.positions import Positions
 from pipeline.extract.transform_messages import LogTransforms
 from pipeline.extract.transforms import TransformTree
@@ -46,7 +47,7 @@ def check_joined(
     if apart and (tree.links or tree.problems or transforms.counts):
         known = "; ".join(_links(tree)) or "none that can be used"
         reason = f"{role} are in the frame {', '.join(apart)}, which no transform of the log joins to another ({known}"
-        lost = "".join(f"; {count} {fault}" for fault, count in transforms.faults())
+        lost = "".join(f"; {told(count, fault)}" for fault, count in transforms.faults())
         raise InputError(f"{reason}{lost}); {_way_out(apart[0], log)}")
     optical = [name for name in apart if "optical" in name.lower()]
     if optical:

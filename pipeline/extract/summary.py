@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.counted import told
 from pipeline.extract.channel_reader import ChannelReader
 from pipeline.extract.positions import Positions
 from pipeline.extract.selection import ROLES
@@ -28,8 +29,8 @@ def tell(counts: Counter[str], suspicions: Suspicions, detections: Positions, lo
         "unmet": "positions do not meet the conditions of `where` and were skipped",
         "bad_covariance": "covariances are not positive definite and were replaced by the default",
         "disowned_covariance": "covariances are called unknown by their type and were not used (see a source's covariance)",
-        "out_of_order": "time stamps were out of order and were sorted",
-        "disagreeing": "simultaneous detections of an agent do not agree with the most accurate one, and were skipped",
+        "out_of_order": "stamps were out of order and were sorted",
+        "disagreeing": "detections do not agree with the most accurate one of their agent at the same moment, and were skipped",
         "spikes": "positions lie far off their track (see extract.max_speed_mps) and were skipped",
         "other_frame": "positions are in another frame than the detections, which no transform joins, and were skipped",
         "no_transform": "positions have no transform near enough in time (see extract.max_extrapolation_s) and were skipped",
@@ -38,7 +39,7 @@ def tell(counts: Counter[str], suspicions: Suspicions, detections: Positions, lo
     }
     for name, meaning in meanings.items():
         if counts[name]:
-            progress.note(f"extract: {counts[name]} {meaning}")
+            progress.note(f"extract: {told(counts[name], meaning)}")
     apart_s = float(np.median(np.abs(detections.time_ns - detections.log_time_ns))) * 1e-9
     if apart_s > _STAMPS_APART_S:
         advice = 'to use the log times give the source time = "log_time"'

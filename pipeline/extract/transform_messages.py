@@ -12,6 +12,7 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
+from pipeline.counted import told
 from pipeline.extract.clocks import Stamps
 from pipeline.extract.field_reader import FieldReader
 from pipeline.extract.mission_clock import MissionClock
@@ -163,7 +164,7 @@ class LogTransforms:
         if self.apart:
             self._progress.note(f"extract: no transform joins the detections' frame to {', '.join(sorted(self.apart))}")
         for meaning, count in self.faults():
-            self._progress.note(f"extract: {count} {meaning}")
+            self._progress.note(f"extract: {told(count, meaning)}")
 
 
 def read_transforms(log: MissionLog, clock: MissionClock, counts: Counter[str], progress: Progress) -> TransformTree:

@@ -1,6 +1,6 @@
 """A clock that was set back in a log whose messages are not numbered: only the order in which they were written tells."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Final
 
 import numpy as np
@@ -17,7 +17,7 @@ from pipeline.suspicions import Suspicions
 
 _MAX_SET: Final = 3
 
-Parts = Mapping[str, Sequence[tuple[ChannelReader, Positions]]]
+Parts = dict[str, list[tuple[ChannelReader, Positions]]]
 
 
 def without_set_back_unnumbered(parts: Parts, log: MissionLog, suspicions: Suspicions) -> Parts:

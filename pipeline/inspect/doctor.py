@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from cadence.errors import CadenceError, ImplausibleInputError, InputError, PartialInputError, UsageError
-from pipeline.counted import counted
+from pipeline.counted import counted, told
 from pipeline.extract.config import ExtractConfig
 from pipeline.extract.stage import write_tables
 from pipeline.ingest.stage import survey_channels
@@ -196,7 +196,7 @@ def _use_lines(diagnosis: Diagnosis) -> list[str]:
     for role, name, whose in (("truth", "num_truth", "the truth"), ("poses", "num_poses", "sensors")):
         if use[name]:
             counts.append(f"{counted(use[name], 'position')} of {whose}{_topics(use, role)}")
-    counts += [f"left out: {use[name]} {words}" for name, words in _LEFT_OUT.items() if use[name]]
+    counts += [f"left out: {told(use[name], words)}" for name, words in _LEFT_OUT.items() if use[name]]
     return counts + [f"not used, though it may hold detections: {channel}: {why}" for channel, why in use["unused"].items()]
 
 

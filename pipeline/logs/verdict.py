@@ -23,8 +23,8 @@ def judge(plan: Plan, tally: Tally, tail: Tail, walk: FileWalk, fault: str) -> N
         found = counted(tally.num_timeless, "message has a log time", "messages have log times")
         plan.doubts.append(f"{found} after the year 2262 and cannot be used.")
     if tally.num_bad_indexes:
-        found = counted(tally.num_bad_indexes, "chunk differs", "chunks differ")
-        plan.remarks.append(f"{found} from their message indexes, which were not used.")
+        found = counted(tally.num_bad_indexes, "chunk differs from its", "chunks differ from their")
+        plan.remarks.append(f"{found} message indexes, which were not used.")
     if plan.summary is None and tail.mark is not None:
         plan.summary = find_summary(walk.file, walk.begin, walk.end, tail.mark.end)
     plan.statistics = plan.summary.statistics if plan.summary is not None else _testimony(tail, walk)

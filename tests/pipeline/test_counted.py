@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.counted import counted
+from pipeline.counted import counted, told
 
 SOURCES = sorted((Path(__file__).resolve().parents[2] / "pipeline").rglob("*.py"))
 
@@ -22,6 +22,12 @@ SOURCES = sorted((Path(__file__).resolve().parents[2] / "pipeline").rglob("*.py"
 )
 def test_what_follows_a_number_fits_it(number: int, words: tuple[str, ...], told: str) -> None:
     assert counted(number, *words) == told
+
+
+def test_what_is_told_of_one_is_in_the_singular() -> None:
+    many = "positions are off the earth and were skipped"
+    assert told(2, many) == f"2 {many}" and told(1, many) == "1 position is off the earth and was skipped"
+    assert told(1, "messages cannot be decoded") == "1 message cannot be decoded"
 
 
 def test_no_line_says_1_agents() -> None:

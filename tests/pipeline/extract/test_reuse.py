@@ -30,7 +30,7 @@ def test_a_name_that_is_given_out_again_becomes_two() -> None:
     found = rows(*car(0, 29, 0.0, 0.0, 10.0), *car(33, 62, 400.0, 350.0, -8.0))
     names, (line,) = named(found)
     assert names == ["7"] * 30 + ["7.2"] * 30
-    assert '"7" jumps 366.9 m in 4 s, 9.17 times its speed; 1 names became 2 agents (7, 7.2, ...)' in line
+    assert '"7" jumps 366.9 m in 4 s, 9.17 times its speed; 1 name became 2 agents (7, 7.2, ...)' in line
     assert named(found, believed="/seen") == (["7"] * 60, [])
 
 

@@ -268,8 +268,8 @@ def test_what_was_left_out_is_told_in_one_line_each(tmp_path: Path, capsys: pyte
     told = capsys.readouterr().err
     assert summary["transforms"]["unconnected_frames"] == ["cart"]
     assert "no transform joins the detections' frame to cart" in told
-    assert "1 messages with transforms cannot be decoded" in told
-    assert "1 positions have no transform near enough in time" in told
+    assert "1 message with transforms cannot be decoded" in told
+    assert "1 position has no transform near enough in time" in told
     ned = write_log(tmp_path / "ned.mcap", [detection(float(i), i, i, frame="local_ned") for i in range(3)])
     write_tables(open_log(ned), tmp_path, ExtractConfig(), Progress())
     assert 'give its sources frame_convention = "ned"' in capsys.readouterr().err

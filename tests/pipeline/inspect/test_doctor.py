@@ -58,7 +58,7 @@ def test_a_sound_log_and_what_of_it_would_be_used(tmp_path: Path) -> None:
     (reason,) = found.undecodable
     assert "/odd" in reason and "smoke" in reason
     text = render(found)
-    assert "SOUND" in text and "20 detections of 2 agents from /detections" in text and "1 positions are NaN" in text
+    assert "SOUND" in text and "20 detections of 2 agents from /detections" in text and "1 position is NaN" in text
     assert "with its schema" in text and exit_code([found]) == 0
 
 

@@ -164,7 +164,7 @@ def test_index_of_another_chunk_is_noticed(write_log):
     damaged[begins[1] : begins[1] + second.message_index_length] = whole[begins[0] : begins[0] + first.message_index_length]
     log = open_log(write_log(bytes(damaged)))
     assert content(log) == reference(whole) and log.health.is_complete
-    assert log.health.problems == ("1 chunks differ from their message indexes, which were not used.",)
+    assert log.health.problems == ("1 chunk differs from its message indexes, which were not used.",)
 
 
 @pytest.mark.parametrize("held", [1, 3000, timeline.MAX_HELD_BYTES])

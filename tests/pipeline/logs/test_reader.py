@@ -108,7 +108,7 @@ def test_messages_of_all_sizes_outside_chunks_are_read_many_at_once(write_log, m
     monkeypatch.setattr(FileWalk, "head", lambda self: one_by_one.append(self.position) or head(self))
     log = open_log(write_log(file.getvalue()))
     assert content(log) == [message for message in reference(file.getvalue()) if message[3] < 2**63]
-    assert log.health.problems[0] == "1 messages have log times after the year 2262 and cannot be used."
+    assert log.health.problems[0] == "1 message has a log time after the year 2262 and cannot be used."
     assert len(one_by_one) < 100 and len(log.metadata()) == 3
     damaged = bytearray(file.getvalue())
     damaged[len(damaged) // 2] ^= 1
