@@ -309,7 +309,7 @@ def report(
     Example:
       cadence report results/flight
     """
-    from pipeline.report.stage import ReportConfig
+    from pipeline.report.config import ReportConfig
     from pipeline.report.stage import report as stage
 
     _show(

@@ -19,8 +19,9 @@ from torch import Tensor
 from benchmarks import publishing
 from benchmarks.publishing import Measurement
 from cadence.bank.rows import active_rows
-from cadence.diffusion.absolute import AbsoluteModel, AbsoluteSampling
+from cadence.diffusion.absolute import AbsoluteModel
 from cadence.diffusion.inpainting import grid_detections, known_cells
+from cadence.diffusion.settings import AbsoluteSampling
 from cadence.metrics import bootstrap_mean
 from cadence.network.trajectory import TrajectoryNetworkConfig
 from cadence.training.loop import OptimiserConfig

@@ -21,7 +21,7 @@ import torch
 from benchmarks import publishing
 from benchmarks.leads import relative_lead
 from benchmarks.publishing import Measurement
-from cadence.diffusion.place import PlaceSampling
+from cadence.diffusion.settings import PlaceSampling
 from cadence.types import Detections, Estimator, HypothesisSet, WindowBatch
 from pipeline.checkpoints import checkpoint_hash, find_checkpoint
 from pipeline.episodes.recordings import RecordingsConfig, RecordingSet, load_recordings

@@ -25,7 +25,7 @@ from benchmarks.publishing import Measurement
 from benchmarks.table1 import EVALUATION_SEED
 from benchmarks.table1_page import LATE, NAMES, measure_rows
 from cadence.bank.rows import active_rows, scatter_hypotheses
-from cadence.diffusion.place import PlaceSampling
+from cadence.diffusion.settings import PlaceSampling
 from cadence.errors import CadenceError
 from cadence.recordings import Recordings
 from cadence.types import Detections, Estimator, HypothesisSet, WindowBatch

@@ -25,8 +25,8 @@ from benchmarks import publishing
 from benchmarks.leads import averaged, relative_lead
 from benchmarks.publishing import Measurement
 from benchmarks.table1_page import MINUTES
-from cadence.diffusion.place import PlaceSampling
 from cadence.diffusion.place_frame import PlaceConfig
+from cadence.diffusion.settings import PlaceSampling
 from cadence.errors import InputError
 from cadence.metrics import Interval
 from cadence.network.place import PlaceNetwork

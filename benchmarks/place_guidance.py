@@ -42,7 +42,8 @@ from benchmarks.place_samplers import (
 from benchmarks.publishing import Measurement
 from cadence.arrays import Float64s
 from cadence.constraints.checker import states_in_collision
-from cadence.diffusion.place import PlaceModel, PlaceSampling
+from cadence.diffusion.place import PlaceModel
+from cadence.diffusion.settings import PlaceSampling
 from cadence.metrics import Interval, bootstrap_ratio
 from cadence.recordings import ForecastWindows, Recordings, choose_windows
 from cadence.worlds import prison_map

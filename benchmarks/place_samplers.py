@@ -24,7 +24,8 @@ from benchmarks import publishing
 from benchmarks.publishing import Measurement
 from cadence.arrays import Int64s
 from cadence.constraints.obstacles import Obstacles
-from cadence.diffusion.place import PlaceModel, PlaceSampling
+from cadence.diffusion.place import PlaceModel
+from cadence.diffusion.settings import PlaceSampling
 from cadence.errors import CadenceError
 from cadence.metrics import Interval, bootstrap_ratio
 from cadence.recordings import ForecastWindows, Recordings, choose_windows, cut_windows

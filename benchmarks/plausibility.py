@@ -21,7 +21,8 @@ from rosbags.typesys import Stores, get_typestore
 from benchmarks import publishing
 from benchmarks.mixed_logs import START_NS, write_mixed_log
 from benchmarks.publishing import Measurement
-from pipeline.extract.stage import ExtractConfig, write_tables
+from pipeline.extract.config import ExtractConfig
+from pipeline.extract.writing import write_tables
 from pipeline.logs.reader import open_log
 from pipeline.mapping.sources import SourceConfig
 from pipeline.progress import Progress

@@ -30,7 +30,8 @@ from cadence import metrics
 from cadence.arrays import Float64s, Int64s
 from cadence.association.associate import associate
 from cadence.association.types import AssociationConfig
-from cadence.diffusion.place import PlaceModel, PlaceSampling
+from cadence.diffusion.place import PlaceModel
+from cadence.diffusion.settings import PlaceSampling
 from cadence.recordings import ForecastWindows, choose_windows, cut_windows
 from cadence.resampling import systematic
 from cadence.types import Detections, HypothesisSet, WindowBatch

@@ -32,8 +32,7 @@ from benchmarks import publishing
 from benchmarks.leads import averaged
 from benchmarks.publishing import Measurement
 from benchmarks.table1_page import MIXTURES, NAMES, Evaluated, Found, section, tables
-from cadence.diffusion.absolute import AbsoluteSampling
-from cadence.diffusion.place import PlaceSampling
+from cadence.diffusion.settings import AbsoluteSampling, PlaceSampling
 from cadence.errors import CadenceError, InputError
 from cadence.recordings import Recordings
 from cadence.types import Estimator

@@ -3,10 +3,10 @@ from .baselines.kalman import ConstantVelocityKalman, OrnsteinUhlenbeckKalman
 from .baselines.library import TrajectoryLibrary
 from .constraints.obstacles import Obstacles
 from .diffusion.absolute import AbsoluteModel
-from .diffusion.feasible import GuidanceConfig
 from .diffusion.general import GeneralModel
 from .diffusion.place import PlaceModel
 from .diffusion.sampler import sample_ddim, sample_ddpm, sample_dpmpp_2m, sample_rotation
+from .diffusion.settings import GuidanceConfig
 from .errors import CadenceError
 from .evidence.estimator import WithEvidence
 from .metrics import ade, coverage, energy_score, mean_error, min_ade

@@ -7,15 +7,17 @@ are not drawn; and where there would be too many the step is longer. What follow
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pyarrow as pa
-import torch
-from torch import Tensor
 
 from cadence.arrays import Bools, Float64s, Int64s
 from cadence.errors import ConfigError, InputError
 from pipeline.tracks import agent_tracks
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 _NICE = np.array([1.0, 1.2, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0])
 _STEPS_PER_GAP = 16.0
@@ -96,8 +98,10 @@ class Grid:
         return self.history_steps - 1
 
     @property
-    def time_s(self) -> Tensor:
+    def time_s(self) -> "Tensor":
         """Step times relative to the origin [T], float64."""
+        import torch  # only now: settings of the grid are read before it is known whether anything is to be drawn
+
         return (torch.arange(self.num_steps, dtype=torch.float64) - self.origin_index) * self.step_s
 
 

@@ -7,15 +7,16 @@ It holds {"version": 1, "obstacles": [...]}; an obstacle is {"kind": "circle", "
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 
-from cadence.constraints.obstacles import Obstacles
 from cadence.errors import InputError
-from cadence.worlds.terrain import Terrain
 from pipeline.documents import parse_json
+
+if TYPE_CHECKING:
+    from cadence.constraints.obstacles import Obstacles
+    from cadence.worlds.terrain import Terrain
 
 VERSION = 1
 OBSTACLES_NAME = "obstacles.json"
@@ -28,7 +29,7 @@ def write_obstacles(path: Path, obstacles: Sequence[Mapping[str, Any]]) -> None:
     path.write_text(json.dumps({"version": VERSION, "obstacles": list(obstacles)}, indent=1) + "\n", encoding="utf-8")
 
 
-def read_obstacles(path: Path) -> Obstacles:
+def read_obstacles(path: Path) -> "Obstacles":
     """The obstacles of a mission as the estimators see them; `InputError` where the file is absent or not ours."""
     return as_obstacles(read_obstacle_entries(path))
 
@@ -46,15 +47,19 @@ def read_obstacle_entries(path: Path) -> list[Json]:
         raise InputError(f"{path}: not a list of obstacles ({error}); run extract again with --force") from error
 
 
-def as_obstacles(entries: Sequence[Mapping[str, Any]]) -> Obstacles:
+def as_obstacles(entries: Sequence[Mapping[str, Any]]) -> "Obstacles":
     """Entries of obstacles.json as the estimators see them. ValueError where one has no meaning."""
+    import torch  # only now: what a mission has to say of obstacles is asked more often than what estimators see
+
+    from cadence.constraints.obstacles import Obstacles
+
     circles = [[entry["x_m"], entry["y_m"], entry["radius_m"]] for entry in entries if entry["kind"] == "circle"]
     polygons = [entry["rings_m"] for entry in entries if entry["kind"] == "polygon"]
     rings = tuple(tuple(torch.tensor(ring, dtype=torch.float64).reshape(-1, 2) for ring in polygon) for polygon in polygons)
     return Obstacles(torch.tensor(circles, dtype=torch.float64).reshape(-1, 3), rings)
 
 
-def obstacles_as_json(terrain: Terrain) -> list[dict[str, Any]]:
+def obstacles_as_json(terrain: "Terrain") -> list[dict[str, Any]]:
     """Obstacles in the format of obstacles.json: circles and polygons in the mission frame, rounded to a millimetre."""
     circles = [{"kind": "circle", "x_m": x, "y_m": y, "radius_m": r} for x, y, r in np.round(terrain.circles_m, 3).tolist()]
     rings = [np.round(polygon, 3).tolist() for polygon in terrain.polygons_m]

@@ -7,8 +7,6 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TypeVar
 
-import torch
-
 _Result = TypeVar("_Result")
 
 
@@ -20,6 +18,8 @@ def num_cores() -> int:
 @contextlib.contextmanager
 def one_thread() -> Iterator[None]:
     """Every computation in one thread: sums that are shared out among threads differ with their number."""
+    import torch  # only now: to count cores must not cost it
+
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -36,6 +36,8 @@ def in_order(pieces: Iterable[Callable[[], _Result]], num_threads: int) -> Itera
     if num_threads <= 1:
         yield from (piece() for piece in pieces)
         return
+    import torch
+
     waiting: deque[Future[_Result]] = deque()
     with ThreadPoolExecutor(num_threads, initializer=torch.set_num_threads, initargs=(1,)) as pool:
         try:

@@ -55,7 +55,7 @@ FLOORS = {
         {"manifest", "tables"},
         {"frames", "stores", "logs", "mapping", "tracks"},
         {"missions", "checkpoints", "grids", "results", "stories"},
-        {"windows"},
+        {"weights", "windows"},
         {"catalogue", "associations"},
         {"estimators", "scoring"},
         {"ingest", "extract", "infer", "export", "report", "simulate", "importing"},  # no stage imports another

@@ -6,7 +6,7 @@ open is a switch here; the defaults are the paper's, except that detections are 
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Literal, Self
+from typing import Self
 
 import torch
 from torch import Tensor
@@ -20,7 +20,6 @@ from cadence.diffusion.guidance import PaperCost, adam_guidance, clean_estimate_
 from cadence.diffusion.inpainting import (
     Correction,
     GridDetections,
-    Inpainting,
     grid_detections,
     known_cells,
     overwritten,
@@ -29,6 +28,7 @@ from cadence.diffusion.inpainting import (
 )
 from cadence.diffusion.noise import RowNoise
 from cadence.diffusion.sampler import Hook, sample_ddim, sample_ddpm, sample_dpmpp_2m
+from cadence.diffusion.settings import AbsoluteSampling
 from cadence.errors import ConfigError
 from cadence.network.trajectory import TrajectoryNetwork, TrajectoryNetworkConfig
 from cadence.types import Context, Detections, HypothesisSet, WindowBatch
@@ -67,44 +67,6 @@ class AbsoluteConfig:
     def horizon_steps(self) -> int:
         """Steps after the origin."""
         return self.network.num_steps - self.history_steps
-
-
-@dataclass(frozen=True)
-class AbsoluteSampling:
-    """What belongs to a call.
-
-    sampler        "ddpm" takes all steps of the schedule, as in the paper; "ddim" and "dpmpp" take fewer
-    num_steps      how many those take
-    inpainting     see `cadence.diffusion.inpainting`; "overwrite" is the paper's
-    length_steps, amplitude  of the smoother's kernel; the amplitude in normalised units
-    floor          standard deviation added to every detection there, normalised: exact ones close in time may disagree a little
-    guidance       "paper": Adam on the mean (algorithm 1; only with ddpm), "clean": on the clean estimate
-    max_speed_mps  speed limit for the guidance "clean"
-    margin_m       distance from obstacles that it asks for
-    learning_rate, iterations  of the paper's guidance
-    chunk          trajectories computed at once
-    encode_each_step  read the detections again for every sample and step, as the authors' code does: for benchmarks only
-    """
-
-    sampler: Literal["ddpm", "ddim", "dpmpp"] = "ddpm"
-    num_steps: int = 10
-    inpainting: Inpainting = "smoother"
-    length_steps: float = 8.0
-    amplitude: float = 0.5
-    floor: float = 1e-4
-    guidance: Literal["none", "paper", "clean"] = "none"
-    max_speed_mps: float | None = None
-    margin_m: float = 0.0
-    learning_rate: float = 1e-2
-    iterations: int = 8
-    chunk: int = 2048
-    encode_each_step: bool = False
-
-    def __post_init__(self) -> None:
-        if self.guidance == "paper" and self.sampler != "ddpm":
-            raise ValueError(f"guidance 'paper' moves the mean of a ddpm step; sampler is {self.sampler!r}")
-        if min(self.num_steps, self.chunk) < 1 or not min(self.length_steps, self.amplitude) > 0 or self.floor < 0:
-            raise ValueError("num_steps, chunk, length_steps and amplitude must be positive, floor not negative")
 
 
 @dataclass(frozen=True, eq=False)

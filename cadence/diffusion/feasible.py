@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass, replace
-from typing import Literal, Self
+from typing import Self
 
 import torch
 from torch import Tensor
@@ -14,6 +14,7 @@ from cadence.constraints.motion import SpeedConstraint
 from cadence.constraints.obstacles import ObstacleConstraint, Obstacles
 from cadence.constraints.speed import exceeds
 from cadence.diffusion.guidance import clean_estimate_guidance
+from cadence.diffusion.settings import GuidanceConfig
 from cadence.resampling import systematic
 from cadence.types import WindowBatch
 
@@ -28,32 +29,6 @@ _CALMING_ROUNDS = 3
 """A way round an obstacle has corners, and a corner that is smoothed may touch the obstacle: in turns."""
 
 _LEAST_WEIGHT = 1e-3
-
-
-@dataclass(frozen=True)
-class GuidanceConfig:
-    """How constraints act on hypotheses.
-
-    mode           "clean" guides while sampling and repairs at the end; "repair" only repairs; "none" ignores constraints;
-                   of the place preset only "none" counts (infer.place says how it guides), and the paper preset has infer.paper
-    margin_m       distance to keep from obstacles
-    max_speed_mps  a speed that the target cannot exceed; None = no limit
-    max_acceleration_mps2  an acceleration, in any direction, that it cannot exceed; of the general preset
-    max_turn_rate_dps  a rate of turn in degrees a second that it cannot exceed while it moves, which means faster than a
-                   twentieth of what is typical of the log; of the general preset
-    """
-
-    mode: Literal["clean", "repair", "none"] = "clean"
-    margin_m: float = 0.0
-    max_speed_mps: float | None = None
-    max_acceleration_mps2: float | None = None
-    max_turn_rate_dps: float | None = None
-
-    def __post_init__(self) -> None:
-        limits = {name: getattr(self, name) for name in ("max_speed_mps", "max_acceleration_mps2", "max_turn_rate_dps")}
-        wrong = [name for name, value in limits.items() if value is not None and not value > 0]
-        if self.margin_m < 0 or wrong:
-            raise ValueError(f"{wrong[0]} must be positive" if wrong else "margin_m must not be negative")
 
 
 @dataclass(frozen=True, eq=False)

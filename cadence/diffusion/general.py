@@ -7,7 +7,6 @@ the bank's own uncertainty, which vanishes where something was seen.
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Literal
 
 import torch
 from torch import Tensor
@@ -15,8 +14,9 @@ from torch import Tensor
 from cadence.bank.bank import Bank, BankPosterior
 from cadence.bank.pool import BankPool
 from cadence.bank.rows import active_rows, scatter_hypotheses, with_status
-from cadence.diffusion.feasible import Feasibility, GuidanceConfig, redrawn, resampled
+from cadence.diffusion.feasible import Feasibility, redrawn, resampled
 from cadence.diffusion.sampler import even_angles, sample_ddim, sample_dpmpp_2m, sample_rotation
+from cadence.diffusion.settings import GuidanceConfig, SamplerName
 from cadence.diffusion.transport import bend_of, smoothed_displacement
 from cadence.network.residual import ResidualNetwork
 from cadence.network.residual_context import ResidualContext, build_context
@@ -24,7 +24,7 @@ from cadence.schedule import clean_from
 from cadence.types import Detections, HypothesisSet, WindowBatch
 
 _SAMPLERS = {"rotation": sample_rotation, "ddim": sample_ddim, "dpmpp": sample_dpmpp_2m}
-SamplerName = Literal["rotation", "ddim", "dpmpp"]
+
 _MAX_BATCH = 960
 _RAMP_STEPS = 8.0
 

@@ -6,18 +6,9 @@ first step of the grid. The residual model must not use any of this: its bank ha
 
 import math
 from dataclasses import dataclass
-from typing import Literal
 
 import torch
 from torch import Tensor
-
-Inpainting = Literal["none", "overwrite", "noise_matched", "smoother"]
-"""How detections are put in.
-
-overwrite      the paper's: after each step the known cells are set to the detections, clean whatever the noise level
-noise_matched  set to the detections with the noise of the current level (Lugmayr et al., "RePaint", CVPR 2022)
-smoother       the clean estimate is moved onto the detections, its neighbours with it: no jumps, covariances count
-"""
 
 _FLOOR = 1e-9
 

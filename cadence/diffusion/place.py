@@ -21,6 +21,7 @@ from cadence.diffusion.noise import RowNoise
 from cadence.diffusion.place_frame import PlaceConfig, future_of, place_inputs, to_pieces, to_track
 from cadence.diffusion.place_team import agent_rows, shared_detections
 from cadence.diffusion.sampler import even_angles, even_log_snr, sample_ddim, sample_ddpm, sample_dpmpp_2m
+from cadence.diffusion.settings import PlaceSampling
 from cadence.errors import ConfigError
 from cadence.network.attention import MAX_AGENTS, Team
 from cadence.network.frozen import FrozenPlace
@@ -36,47 +37,6 @@ with 25 in every score and in the lengths of steps, where eight evenly spaced an
 _SLACK = {"clean": 0.25, "final": 0.05}
 """What guidance keeps from obstacles beside the margin, in pieces of the future, by the stage at which it moves a track: a
 straight line between two knots on an edge cuts through the obstacle, and what is moved while sampling is moved again."""
-
-
-@dataclass(frozen=True)
-class PlaceSampling:
-    """How a place model is sampled.
-
-    sampler     "few": the few steps that the weights were tuned for, which take no other; "ddpm", "ddim", "dpmpp": any number
-                for weights that were trained by diffusion alone; "auto": few where the weights are tuned, else dpmpp
-    num_steps   of ddpm, ddim and dpmpp
-    is_antithetic  hypotheses come in pairs that begin with mirrored noise: each is still a draw of the distribution, and a few
-                stand for it better than as many independent ones. Not with ddpm, which adds noise at every step
-    guidance    away from obstacles: "final" moves the finished track, "clean" every clean estimate, "paper" every mean
-                (algorithm 1; with ddpm), "none". Moved while it is still uncertain, a track becomes another one; the finished
-                track changes least, and leaves little to repair, which is slow
-    is_repaired lead what still crosses an obstacle around it at the end
-    margin_m    distance that is kept from obstacles
-    learning_rate, iterations, step_weight  of the paper's guidance; the last is the weight of the mean step length, which is
-                smallest for targets that do not move
-    precision   of the network's layers; "bfloat16" is quicker on processors that have it, at a rounding that no score shows
-    chunk       tracks computed at once
-    encode_each_step  read the detections again for every hypothesis and step, as the authors' code does: for benchmarks only
-    """
-
-    sampler: Literal["auto", "few", "ddpm", "ddim", "dpmpp"] = "auto"
-    num_steps: int = 6
-    is_antithetic: bool = True
-    guidance: Literal["none", "final", "clean", "paper"] = "final"
-    is_repaired: bool = True
-    margin_m: float = 0.0
-    learning_rate: float = 1e-2
-    iterations: int = 8
-    step_weight: float = 50.0
-    precision: Literal["float32", "bfloat16"] = "float32"
-    chunk: int = 1024
-    encode_each_step: bool = False
-
-    def __post_init__(self) -> None:
-        if self.guidance == "paper" and self.sampler != "ddpm":
-            raise ValueError(f"guidance 'paper' moves the mean of a ddpm step; sampler is {self.sampler!r}")
-        if min(self.num_steps, self.chunk, self.iterations) < 1 or min(self.margin_m, self.step_weight) < 0:
-            raise ValueError("num_steps, chunk and iterations must be at least 1, margin_m and step_weight not negative")
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from cadence.evidence.choosing import ENOUGH, Choice, choose_apart, choose_together, evened
+from cadence.evidence.settings import WeighingConfig
 from cadence.evidence.weights import Said, effective, hear
 from cadence.seeds import numpy_stream
 from cadence.types import Detections, Estimator, HypothesisSet, WindowBatch
@@ -22,24 +23,6 @@ CONTRADICTED, FEW_FIT = "contradicted", "few_fit"
 _FEWEST = 0.1
 _MOST_NUMBERS = 8_000_000
 """Coordinates drawn at once where more hypotheses are drawn: 64 MB."""
-
-
-@dataclass(frozen=True)
-class WeighingConfig:
-    """How hypotheses are weighed by evidence.
-
-    is_used    false: evidence is left out
-    most_draws where fewer than half of the hypotheses of a window count, so many times as many are drawn to choose from
-    is_equal   hypotheses are drawn again by their weights, so that all count the same and some are there several times
-    """
-
-    is_used: bool = True
-    most_draws: int = 8
-    is_equal: bool = False
-
-    def __post_init__(self) -> None:
-        if self.most_draws < 1:
-            raise ValueError(f"most_draws must be at least 1, got {self.most_draws}")
 
 
 @dataclass(frozen=True, eq=False)

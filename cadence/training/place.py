@@ -8,8 +8,9 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
-from cadence.diffusion.place import PlaceModel, PlaceSampling
+from cadence.diffusion.place import PlaceModel
 from cadence.diffusion.place_frame import PlaceConfig
+from cadence.diffusion.settings import PlaceSampling
 from cadence.network.place import PlaceNetwork, PlaceNetworkConfig
 from cadence.recordings import Recordings
 from cadence.seeds import numpy_stream, torch_stream

@@ -6,7 +6,7 @@ from pipeline.export.config import ExportConfig
 from pipeline.extract.config import ExtractConfig
 from pipeline.infer.config import InferConfig
 from pipeline.ingest.stage import IngestConfig
-from pipeline.report.stage import ReportConfig
+from pipeline.report.config import ReportConfig
 
 
 @dataclass(frozen=True)

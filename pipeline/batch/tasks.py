@@ -24,7 +24,6 @@ from pipeline.missions import find_missions
 from pipeline.out_of_memory import ADVICE, is_out_of_memory
 from pipeline.progress import Progress, Told
 from pipeline.report.stage import report
-from pipeline.threads import one_thread
 
 STAGES = ("ingest", "extract", "infer", "export", "report")
 _PROGRESS = (0.0, 0.05, 0.1, 0.85, 0.95, 1.0)
@@ -60,7 +59,7 @@ def run_task(task: LogTask, progress: Progress) -> LogOutcome:
     finished: list[StageResult] = []
     message, code, trace = "", 0, ""
     try:
-        with one_thread(), locked(Path(task.directory), progress.note):
+        with locked(Path(task.directory), progress.note):
             for stage, (begin, end) in zip(_RUNS, itertools.pairwise(_PROGRESS), strict=True):
                 finished.append(stage(task, progress.part(begin, end)))
     except NothingDetectedError as error:  # of a damaged log nobody knows: detections may be lost

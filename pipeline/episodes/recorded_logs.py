@@ -16,7 +16,7 @@ from cadence.errors import InputError
 from cadence.recordings import Recordings
 from pipeline.documents import parse_json
 from pipeline.extract.config import ExtractConfig
-from pipeline.extract.stage import write_tables
+from pipeline.extract.writing import write_tables
 from pipeline.logs.reader import MissionLog, open_log
 from pipeline.mapping.guess import suggest_mapping
 from pipeline.obstacle_file import OBSTACLES_NAME

@@ -13,11 +13,12 @@ from cadence.diffusion.gate import gated
 from cadence.diffusion.general import GeneralModel
 from cadence.errors import ConfigError, DeviceError
 from cadence.network.residual import ResidualNetwork, ResidualNetworkConfig
-from pipeline.checkpoints import expect_preset, load_network, network_config
+from pipeline.checkpoints import expect_preset, network_config
 from pipeline.estimators.fitting import FittingData
 from pipeline.estimators.loaded import Fitted, Loaded
 from pipeline.estimators.samplings import Samplings
 from pipeline.grids import GridConfig
+from pipeline.weights import load_network
 
 
 def load_general(weights: Path | None, samplings: Samplings) -> Loaded:

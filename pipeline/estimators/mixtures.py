@@ -2,19 +2,15 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
 
 from cadence.baselines.grammi import GrammiNetwork, GrammiNetworkConfig
 from cadence.baselines.mixture import MixtureFrame, MixtureModel
 from cadence.baselines.vrnn import VrnnNetwork, VrnnNetworkConfig
-from pipeline.checkpoints import CheckpointInfo, expect_preset, load_network, network_config
+from pipeline.checkpoints import RIVALS, CheckpointInfo, expect_preset, network_config
 from pipeline.estimators.loaded import Loaded
 from pipeline.estimators.samplings import Samplings
 from pipeline.grids import GridConfig
-
-Rival = Literal["vrnn", "grammi_without_mi", "grammi"]
-RIVALS: tuple[Rival, ...] = ("vrnn", "grammi_without_mi", "grammi")
-"""Presets of this module."""
+from pipeline.weights import load_network
 
 
 @dataclass(frozen=True)

@@ -2,12 +2,14 @@
 
 from pathlib import Path
 
-from cadence.diffusion.absolute import AbsoluteConfig, AbsoluteModel, AbsoluteSampling
+from cadence.diffusion.absolute import AbsoluteConfig, AbsoluteModel
+from cadence.diffusion.settings import AbsoluteSampling
 from cadence.network.trajectory import TrajectoryNetwork
-from pipeline.checkpoints import expect_preset, load_network, network_config
+from pipeline.checkpoints import expect_preset, network_config
 from pipeline.estimators.loaded import Loaded
 from pipeline.estimators.samplings import Samplings
 from pipeline.grids import GridConfig
+from pipeline.weights import load_network
 
 
 def load_paper(weights: Path, samplings: Samplings) -> Loaded:

@@ -3,15 +3,16 @@
 import dataclasses
 from pathlib import Path
 
-from cadence.diffusion.feasible import GuidanceConfig
-from cadence.diffusion.place import PlaceModel, PlaceSampling
+from cadence.diffusion.place import PlaceModel
 from cadence.diffusion.place_frame import PlaceConfig
+from cadence.diffusion.settings import GuidanceConfig, PlaceSampling
 from cadence.errors import ConfigError
 from cadence.recordings import NUM_STEPS
-from pipeline.checkpoints import expect_preset, load_network, network_config
+from pipeline.checkpoints import expect_preset, network_config
 from pipeline.estimators.loaded import Loaded
 from pipeline.estimators.samplings import Samplings
 from pipeline.grids import GridConfig
+from pipeline.weights import load_network
 
 _CONTEXT_STEPS = 4320
 """The longest mission of the paper's worlds."""

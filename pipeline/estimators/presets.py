@@ -1,22 +1,22 @@
 """The presets: every kind of checkpoint, how it becomes an estimator, and which settings it reads.
 
-A new preset is a module beside this one and an entry in PRESETS.
+A new preset is a module beside this one and an entry in PRESETS. Modules are imported when they load something: which settings
+are read is asked before every run, also where nothing is to be done, and must not cost torch.
 """
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from cadence.errors import ConfigError, DeviceError
-from cadence.types import Estimator
-from pipeline.checkpoints import find_checkpoint, read_info
+from pipeline.checkpoints import RIVALS, find_checkpoint, read_info
 from pipeline.config import changed_settings
-from pipeline.estimators.general import load_general
-from pipeline.estimators.loaded import Loaded
-from pipeline.estimators.mixtures import RIVALS, load_mixture
-from pipeline.estimators.paper import load_paper
-from pipeline.estimators.place import load_place
 from pipeline.estimators.samplings import Samplings
+
+if TYPE_CHECKING:
+    from cadence.types import Estimator
+    from pipeline.estimators.loaded import Loaded
 
 NO_CHECKPOINT = "none"
 """Stands for the bank alone where a checkpoint is named."""
@@ -34,11 +34,35 @@ class Preset:
     forecasts  it forecasts by the paper's protocol, without being fitted to a log
     """
 
-    load: Callable[[Path, Samplings], Loaded]
+    load: Callable[[Path, Samplings], "Loaded"]
     reads: tuple[str, ...] = ()
     runs_on: tuple[str, ...] = ("cpu",)
     infers: bool = True
     forecasts: bool = True
+
+
+def _load_general(weights: Path | None, samplings: Samplings) -> "Loaded":
+    from pipeline.estimators.general import load_general
+
+    return load_general(weights, samplings)
+
+
+def _load_place(weights: Path, samplings: Samplings) -> "Loaded":
+    from pipeline.estimators.place import load_place
+
+    return load_place(weights, samplings)
+
+
+def _load_paper(weights: Path, samplings: Samplings) -> "Loaded":
+    from pipeline.estimators.paper import load_paper
+
+    return load_paper(weights, samplings)
+
+
+def _load_mixture(weights: Path, samplings: Samplings) -> "Loaded":
+    from pipeline.estimators.mixtures import load_mixture
+
+    return load_mixture(weights, samplings)
 
 
 READ_BY_ALL = (
@@ -51,10 +75,10 @@ READ_BY_ALL = (
 _BANK = ("grid.", "guidance.")
 
 PRESETS: Mapping[str, Preset] = {
-    "general": Preset(load_general, ("sampler", "num_steps", "is_gated", *_BANK), ("cpu", "cuda"), forecasts=False),
-    "place": Preset(load_place, ("is_tested", "place.", "guidance.")),
-    "paper": Preset(load_paper, ("is_tested", "paper.")),
-    **dict.fromkeys(RIVALS, Preset(load_mixture, infers=False)),
+    "general": Preset(_load_general, ("sampler", "num_steps", "is_gated", *_BANK), ("cpu", "cuda"), forecasts=False),
+    "place": Preset(_load_place, ("is_tested", "place.", "guidance.")),
+    "paper": Preset(_load_paper, ("is_tested", "paper.")),
+    **dict.fromkeys(RIVALS, Preset(_load_mixture, infers=False)),
 }
 
 
@@ -63,15 +87,15 @@ def find_weights(checkpoint: str) -> Path | None:
     return None if checkpoint == NO_CHECKPOINT else find_checkpoint(checkpoint)
 
 
-def load_estimator(checkpoint: str, samplings: Samplings) -> Loaded:
+def load_estimator(checkpoint: str, samplings: Samplings) -> "Loaded":
     """What infer draws with. `ConfigError` for checkpoints that cannot be read or do not infer."""
     weights = find_weights(checkpoint)
     if weights is None:
-        return load_general(None, samplings)
+        return _load_general(None, samplings)
     return _load(_preset(weights, "draw hypotheses of missions", lambda preset: preset.infers), weights, samplings)
 
 
-def load_forecaster(checkpoint: str, samplings: Samplings | None = None) -> Estimator:
+def load_forecaster(checkpoint: str, samplings: Samplings | None = None) -> "Estimator":
     """The estimator that the paper's protocol scores. `ConfigError` for checkpoints that cannot be read or do not forecast."""
     weights = find_checkpoint(checkpoint)
     preset = _preset(weights, "forecast", lambda preset: preset.forecasts)
@@ -106,7 +130,7 @@ def _unread(settings: Iterable[str], reads: Iterable[str]) -> list[str]:
     ]
 
 
-def _load(preset: Preset, weights: Path, samplings: Samplings) -> Loaded:
+def _load(preset: Preset, weights: Path, samplings: Samplings) -> "Loaded":
     device = samplings.device
     if device != "auto" and device.partition(":")[0] not in preset.runs_on:
         known = ", ".join(preset.runs_on)

@@ -2,10 +2,7 @@
 
 from dataclasses import dataclass, field
 
-from cadence.diffusion.absolute import AbsoluteSampling
-from cadence.diffusion.feasible import GuidanceConfig
-from cadence.diffusion.general import SamplerName
-from cadence.diffusion.place import PlaceSampling
+from cadence.diffusion.settings import AbsoluteSampling, GuidanceConfig, PlaceSampling, SamplerName
 
 
 @dataclass(frozen=True)

@@ -20,8 +20,6 @@ from pipeline.results import MissionHypotheses, read_hypothesis_tables
 from pipeline.tables import read_table
 from pipeline.tracks import UNKNOWN_AGENT, agent_tracks
 
-TABLES = ("hypotheses.parquet", "windows.parquet", "detections.parquet")
-
 _VERTICES, _FEWEST_VERTICES = 48, 4
 _LINE_BYTES, _VERTEX_BYTES, _MARK_BYTES = 70.0, 20.0, 400.0
 """On the wire, before compression: of a line, each of its points where all are flat, and all marks of an agent at a moment."""

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from pipeline.extract.obstacle_sources import ObstacleSources
+from pipeline.extract.obstacle_config import ObstacleSources
 from pipeline.extract.thinning import ThinningConfig
 from pipeline.mapping.sources import SourceConfig
 from pipeline.moments import moment_ns

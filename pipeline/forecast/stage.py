@@ -21,8 +21,7 @@ import torch
 from torch import Tensor
 
 from cadence.constraints.obstacles import Obstacles
-from cadence.diffusion.absolute import AbsoluteSampling
-from cadence.diffusion.place import PlaceSampling
+from cadence.diffusion.settings import AbsoluteSampling, PlaceSampling
 from cadence.errors import ConfigError, InputError
 from cadence.recordings import ForecastWindows, Recordings, choose_windows, cut_windows
 from cadence.types import Detections, Estimator, HypothesisSet, WindowBatch

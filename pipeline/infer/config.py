@@ -3,11 +3,8 @@
 from dataclasses import dataclass, field
 
 from cadence.association.types import AssociationConfig
-from cadence.diffusion.absolute import AbsoluteSampling
-from cadence.diffusion.feasible import GuidanceConfig
-from cadence.diffusion.general import SamplerName
-from cadence.diffusion.place import PlaceSampling
-from cadence.evidence.estimator import WeighingConfig
+from cadence.diffusion.settings import AbsoluteSampling, GuidanceConfig, PlaceSampling, SamplerName
+from cadence.evidence.settings import WeighingConfig
 from pipeline.checkpoints import DEFAULT
 from pipeline.estimators.samplings import GeneralSampling, Samplings
 from pipeline.grids import GridConfig

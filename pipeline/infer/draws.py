@@ -11,7 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from cadence.evidence.estimator import CONTRADICTED, FEW_FIT, WeighingConfig, weighed_as_drawn
+from cadence.evidence.estimator import CONTRADICTED, FEW_FIT, weighed_as_drawn
+from cadence.evidence.settings import WeighingConfig
 from cadence.types import Estimator, HypothesisSet
 from pipeline.associations import AssociatedWindows
 from pipeline.windows import MissionWindows

@@ -9,8 +9,8 @@ from typing import Any, Literal
 from cadence.errors import CadenceError, ImplausibleInputError, InputError, PartialInputError, UsageError
 from pipeline.counted import counted, told
 from pipeline.extract.config import ExtractConfig
-from pipeline.extract.stage import write_tables
-from pipeline.ingest.stage import survey_channels
+from pipeline.extract.writing import write_tables
+from pipeline.ingest.writing import survey_channels
 from pipeline.inspect.log_times import time_remarks
 from pipeline.logs.container import container_remarks
 from pipeline.logs.health import utc

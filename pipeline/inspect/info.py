@@ -7,7 +7,7 @@ from pathlib import Path
 from pipeline.accuracies import lines
 from pipeline.catalogue import CatalogueChannel
 from pipeline.counted import counted
-from pipeline.ingest.stage import survey_channels
+from pipeline.ingest.writing import survey_channels
 from pipeline.inspect.doctor import use_of
 from pipeline.logs.parts import recorded_parts
 from pipeline.logs.reader import Health, open_log, open_parts, utc

@@ -20,9 +20,9 @@ from pipeline.catalogue import Catalogue, read_catalogue, stated_path
 from pipeline.documents import parse_json
 from pipeline.files import hash_file
 from pipeline.manifest import read_manifest
-from pipeline.missions import CATALOGUE_NAME, no_mission
 from pipeline.obstacle_file import OBSTACLES_NAME, as_obstacles, read_obstacle_entries
 from pipeline.presence import with_presence
+from pipeline.report.inputs import STAGES
 from pipeline.report.origins import Origins, origins_of, with_likeliest
 from pipeline.results import AgentHypotheses, MissionHypotheses, WindowHypotheses, read_hypothesis_tables
 from pipeline.tables import Frame, read_table
@@ -32,9 +32,6 @@ JsonDict = dict[str, Any]
 
 LIKELY = 0.5
 """An agent that is less likely there than this is rather none, as for `cadence evaluate`."""
-
-STAGES = ("ingest", "extract", "infer", "export", "evaluate")
-"""Stages whose manifests the page shows, in the order of the work."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,22 +189,6 @@ class Mission:
     def origins_ns(self) -> dict[int, int]:
         """Origin by window, in the order of time."""
         return dict(sorted({row.window: row.origin_ns for row in self.rows}.items(), key=lambda item: (item[1], item[0])))
-
-
-def mission_inputs(directory: Path) -> list[Path]:
-    """The files of `directory` that the page depends on, as far as they exist; `InputError` for no mission directory."""
-    if not (directory / CATALOGUE_NAME).is_file():
-        raise no_mission(directory)
-    names = [CATALOGUE_NAME, "detections.parquet", "hypotheses.parquet", "windows.parquet", OBSTACLES_NAME]
-    names += [
-        "associations.parquet",
-        "labels.parquet",
-        "truth.parquet",
-        "poses.parquet",
-        "scores.json",
-        *(f"{stage}.manifest.json" for stage in STAGES),
-    ]
-    return [directory / name for name in names if (directory / name).is_file()]
 
 
 def load_mission(directory: Path) -> Mission:

@@ -12,13 +12,14 @@ from cadence.network.place import Pieces, PlaceInputs, PlaceNetwork
 from cadence.seeds import numpy_stream
 from cadence.training.loop import Trainer, untrained
 from cadence.training.place_losses import PlaceWindows, diffusion_loss, energy_loss, place_windows
-from pipeline.checkpoints import find_checkpoint, load_weights
+from pipeline.checkpoints import find_checkpoint
 from pipeline.episodes.pool import EpisodePool, load_pool
 from pipeline.manifest import StageResult
 from pipeline.progress import Progress
 from pipeline.train.config import PlaceTraining, TrainConfig
 from pipeline.train.lessons import Lessons
 from pipeline.train.run import TrainingRun, run_training
+from pipeline.weights import load_weights
 
 _VALIDATION_BATCH = 250
 

@@ -19,22 +19,15 @@ from cadence.recordings import Recordings, cut_windows
 from cadence.seeds import numpy_stream, torch_stream
 from cadence.training.loop import Trainer, untrained
 from cadence.training.mixtures import MixtureWindows, grammi_loss, hidden_goals, mixture_windows, vrnn_loss
-from pipeline.checkpoints import (
-    CheckpointInfo,
-    expect_preset,
-    load_weights,
-    read_info,
-    read_note,
-    save_checkpoint,
-    write_tensors,
-)
+from pipeline.checkpoints import RIVALS, CheckpointInfo, expect_preset, read_info
 from pipeline.episodes.recordings import RecordingsConfig, load_recordings
-from pipeline.estimators.mixtures import RIVALS, GrammiConfig, VrnnConfig, fresh_rival, rival_config
+from pipeline.estimators.mixtures import GrammiConfig, VrnnConfig, fresh_rival, rival_config
 from pipeline.manifest import StageResult
 from pipeline.progress import Progress
 from pipeline.train.config import RivalTraining, TrainConfig
 from pipeline.train.lessons import Lessons, in_parts
 from pipeline.train.run import OUTPUTS, TrainingRun, run_training
+from pipeline.weights import load_weights, read_note, save_checkpoint, write_tensors
 
 _BATCHES_A_BLOCK = 32
 """Batches cut at once: cutting has a fixed cost that goes with the recordings."""

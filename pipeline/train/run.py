@@ -15,21 +15,14 @@ from torch import nn
 
 from cadence.errors import InputError
 from cadence.training.loop import Trainer
-from pipeline.checkpoints import (
-    WEIGHTS_NAME,
-    CheckpointInfo,
-    read_info,
-    read_note,
-    save_checkpoint,
-    windows_seen,
-    write_tensors,
-)
+from pipeline.checkpoints import WEIGHTS_NAME, CheckpointInfo, read_info, windows_seen
 from pipeline.config import config_as_dict
 from pipeline.files import write_atomic
 from pipeline.manifest import StageResult
 from pipeline.progress import Progress
 from pipeline.train.config import TrainConfig
 from pipeline.train.lessons import Lessons, W
+from pipeline.weights import read_note, save_checkpoint, write_tensors
 
 Curve = list[tuple[int, float, float]]
 """(step, training loss, validation loss) of every validation."""

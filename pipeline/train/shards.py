@@ -14,7 +14,7 @@ from safetensors.torch import load_file
 from cadence.network.residual_context import ResidualContext
 from cadence.seeds import derived_seed
 from cadence.training.synthetic import ResidualWindows, SyntheticConfig, synthesise
-from pipeline.checkpoints import write_tensors
+from pipeline.weights import write_tensors
 
 SCENARIOS_PER_SHARD = 32
 

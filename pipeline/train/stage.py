@@ -5,7 +5,7 @@ from pathlib import Path
 
 import torch
 
-from pipeline.estimators.mixtures import RIVALS
+from pipeline.checkpoints import RIVALS
 from pipeline.manifest import StageResult
 from pipeline.progress import Progress
 from pipeline.train.config import TrainConfig

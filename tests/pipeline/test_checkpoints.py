@@ -8,19 +8,11 @@ import torch
 
 from cadence.errors import CadenceError, ConfigError, DeviceError
 from cadence.network.residual import ResidualNetwork, ResidualNetworkConfig
-from pipeline.checkpoints import (
-    DEFAULT,
-    CheckpointInfo,
-    checkpoint_hash,
-    find_checkpoint,
-    load_weights,
-    network_config,
-    read_info,
-    save_checkpoint,
-)
+from pipeline.checkpoints import DEFAULT, CheckpointInfo, checkpoint_hash, find_checkpoint, network_config, read_info
 from pipeline.config import config_as_dict
 from pipeline.estimators.general import load_general
 from pipeline.estimators.samplings import Samplings
+from pipeline.weights import load_weights, save_checkpoint
 
 SMALL = ResidualNetworkConfig(width=8, multipliers=(1, 2), encoder_size=8, level_size=8)
 INFO = CheckpointInfo("general", config_as_dict(SMALL), {"steps": 3}, {"validation_loss": 0.5})

@@ -6,7 +6,7 @@ from typing import Literal
 
 import pytest
 
-from cadence.diffusion.place import PlaceSampling
+from cadence.diffusion.settings import PlaceSampling
 from cadence.errors import ConfigError
 from pipeline.config import (
     config_as_dict,

@@ -16,8 +16,11 @@ from types import FrameType
 
 from cadence.errors import DeviceError
 from pipeline.batch.outcome import LogOutcome, LogTask
-from pipeline.batch.tasks import RunTask, Watch
+from pipeline.batch.tasks import STAGES, RunTask, Watch
 from pipeline.progress import RelayedProgress, Told
+
+PRELOADED = ["pipeline.batch.run", *(f"pipeline.{stage}.writing" for stage in STAGES)]
+"""What workers need, so that they start with it and share its memory."""
 
 _GRACE_S = 10.0
 _NUM_STARTS = 2
@@ -38,7 +41,7 @@ def run_in_processes(
     workers: dict[Connection, _Worker] = {}
     # Forked from a process that has imported everything and runs no threads: workers start at once and share that memory.
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["pipeline.batch.run"])
+    context.set_forkserver_preload(PRELOADED)
     try:
         while waiting or workers:
             while waiting and len(workers) < num_workers:

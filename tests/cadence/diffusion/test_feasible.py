@@ -15,8 +15,9 @@ from cadence.constraints.limits import KeepOut
 from cadence.constraints.obstacles import Obstacles
 from cadence.constraints.speed import exceeds
 from cadence.diffusion import general
-from cadence.diffusion.feasible import Feasibility, GuidanceConfig, resampled
+from cadence.diffusion.feasible import Feasibility, resampled
 from cadence.diffusion.general import GeneralModel
+from cadence.diffusion.settings import GuidanceConfig
 from cadence.types import Context, Detections, WindowBatch
 
 NUM = 8

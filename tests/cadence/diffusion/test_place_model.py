@@ -10,8 +10,9 @@ import torch
 from cadence import metrics
 from cadence.constraints.checker import segments_in_collision, states_in_collision
 from cadence.constraints.obstacles import Obstacles
-from cadence.diffusion.place import PlaceModel, PlaceSampling
+from cadence.diffusion.place import PlaceModel
 from cadence.diffusion.place_frame import PlaceConfig, future_of, place_inputs, recorded_track, to_pieces, to_track
+from cadence.diffusion.settings import PlaceSampling
 from cadence.errors import ConfigError
 from cadence.network.place import PlaceNetworkConfig
 from cadence.recordings import ForecastWindows, Recordings, cut_windows

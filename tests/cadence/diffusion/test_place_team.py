@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from cadence.diffusion.place import PlaceModel, PlaceSampling
+from cadence.diffusion.place import PlaceModel
 from cadence.diffusion.place_frame import PlaceConfig, place_inputs
 from cadence.diffusion.place_team import agent_rows, shared_detections
+from cadence.diffusion.settings import PlaceSampling
 from cadence.errors import ConfigError
 from cadence.network.attention import MAX_AGENTS
 from cadence.network.frozen import FrozenPlace

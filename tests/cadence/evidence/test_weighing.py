@@ -9,7 +9,8 @@ import pytest
 import torch
 
 from cadence.evidence.choosing import choose_apart, choose_together, evened
-from cadence.evidence.estimator import CONTRADICTED, FEW_FIT, WeighingConfig, WithEvidence, weighed_as_drawn, with_past
+from cadence.evidence.estimator import CONTRADICTED, FEW_FIT, WithEvidence, weighed_as_drawn, with_past
+from cadence.evidence.settings import WeighingConfig
 from cadence.seeds import derived_seeds
 from cadence.types import Context, Detections, HypothesisSet, Tracks, WindowBatch
 

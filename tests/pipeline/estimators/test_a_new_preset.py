@@ -12,7 +12,7 @@ from torch import nn
 from cadence.bank.rows import scatter_hypotheses
 from cadence.errors import ConfigError, DeviceError
 from cadence.types import Detections, HypothesisSet, WindowBatch
-from pipeline.checkpoints import CheckpointInfo, save_checkpoint
+from pipeline.checkpoints import CheckpointInfo
 from pipeline.estimators import presets
 from pipeline.estimators.loaded import Loaded
 from pipeline.estimators.presets import Preset, load_estimator, load_forecaster, refuse_unread
@@ -22,6 +22,7 @@ from pipeline.infer.config import InferConfig
 from pipeline.infer.stage import infer
 from pipeline.progress import Progress
 from pipeline.results import read_hypothesis_tables
+from pipeline.weights import save_checkpoint
 
 
 @dataclasses.dataclass(frozen=True)

@@ -15,7 +15,7 @@ from cadence.types import Detections, HypothesisSet, WindowBatch
 from pipeline.estimators.fit_test import FitTest, fit_test
 from pipeline.estimators.fitting import FittingData
 from pipeline.grids import GridConfig, plan_grid
-from pipeline.infer import stage
+from pipeline.infer import plan, stage
 from pipeline.infer.config import InferConfig
 from pipeline.progress import Progress
 from pipeline.suspicions import suspicions_in
@@ -89,7 +89,7 @@ def test_too_few_later_detections_tell_nothing() -> None:
 def test_a_strange_log_is_drawn_with_the_default_and_suspected(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_table(detections(), tmp_path / "detections.parquet", "detections", Frame("local_enu", 50.8, -1.2))
     (tmp_path / "obstacles.json").write_text(json.dumps({"version": 1, "obstacles": []}))
-    monkeypatch.setattr(stage, "DEFAULT", "none")  # quicker
+    monkeypatch.setattr(plan, "DEFAULT", "none")  # quicker
     config = InferConfig(num_hypotheses=2, checkpoint="prison", device="cpu")
     with pytest.raises(ImplausibleInputError, match=r"refused by --strict.*checkpoint of prison: it does not fit this log"):
         stage.infer(tmp_path, dataclasses.replace(config, is_strict=True), Progress(quiet=True))

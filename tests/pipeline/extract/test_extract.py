@@ -15,8 +15,9 @@ from cadence.errors import CadenceError, ConfigError, InputError, NothingDetecte
 from pipeline.config import read_config
 from pipeline.extract.config import ExtractConfig
 from pipeline.extract.selection import ROLES, _no_detections, select_readers
-from pipeline.extract.stage import extract, write_tables
+from pipeline.extract.stage import extract
 from pipeline.extract.thinning import ThinningConfig
+from pipeline.extract.writing import write_tables
 from pipeline.ingest.stage import IngestConfig, ingest
 from pipeline.logs.reader import Channel, open_log
 from pipeline.mapping.guess import suggest_mapping

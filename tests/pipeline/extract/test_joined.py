@@ -11,7 +11,7 @@ from test_extract import QUIET, fails, mk, run
 
 from cadence.errors import InputError
 from pipeline.extract.config import ExtractConfig
-from pipeline.extract.stage import write_tables
+from pipeline.extract.writing import write_tables
 from pipeline.logs.reader import open_log
 
 ROS = Builder(store_with())

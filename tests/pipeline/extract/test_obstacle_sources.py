@@ -14,7 +14,8 @@ from rosbags.typesys import Stores, get_typestore
 
 from cadence.errors import ConfigError, InputError
 from pipeline.config import read_config
-from pipeline.extract.obstacle_sources import ObstacleSources, collect_obstacles
+from pipeline.extract.obstacle_config import ObstacleSources
+from pipeline.extract.obstacle_sources import collect_obstacles
 from pipeline.frames import to_local
 from pipeline.logs.reader import open_log
 from pipeline.obstacle_file import read_obstacles, write_obstacles

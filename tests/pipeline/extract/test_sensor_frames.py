@@ -20,7 +20,7 @@ from test_extract import Extracted, fails, mk, run
 
 from cadence.errors import ConfigError, InputError
 from pipeline.extract.config import ExtractConfig
-from pipeline.extract.stage import write_tables
+from pipeline.extract.writing import write_tables
 from pipeline.logs.reader import open_log
 from pipeline.progress import Progress
 

@@ -14,7 +14,7 @@ from fixtures.small_logs import Row, detection, pose, write_log
 
 import cli
 from cadence.constraints.obstacles import Obstacles
-from cadence.diffusion.absolute import AbsoluteSampling
+from cadence.diffusion.settings import AbsoluteSampling
 from cadence.errors import ConfigError, UsageError
 from cadence.types import Context, Detections, HypothesisSet, WindowBatch
 from pipeline.config import read_config

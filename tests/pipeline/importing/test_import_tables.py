@@ -11,7 +11,7 @@ import shapely
 
 import cli
 from pipeline.extract.config import ExtractConfig
-from pipeline.extract.stage import write_tables
+from pipeline.extract.writing import write_tables
 from pipeline.frames import to_geodetic
 from pipeline.importing.stage import import_settings, import_table
 from pipeline.logs.reader import open_log

@@ -8,7 +8,8 @@ import torch
 from test_infer import CONFIG, GRID, START_NS, detections
 
 from cadence.constraints.obstacles import Obstacles
-from cadence.evidence.estimator import WeighingConfig, WithEvidence
+from cadence.evidence.estimator import WithEvidence
+from cadence.evidence.settings import WeighingConfig
 from cadence.types import Tracks
 from pipeline.associations import build_associated_windows, tell_sources
 from pipeline.estimators.fitting import FittingData

@@ -12,18 +12,17 @@ import pytest
 import torch
 
 from cadence.constraints.checker import segments_in_collision, states_in_collision
-from cadence.diffusion.feasible import GuidanceConfig
-from cadence.diffusion.place import PlaceSampling
+from cadence.diffusion.settings import GuidanceConfig, PlaceSampling
 from cadence.errors import CadenceError, ConfigError, DeviceError, InputError
 from cadence.network.residual import ResidualNetwork, ResidualNetworkConfig
-from pipeline.checkpoints import CheckpointInfo, checkpoint_hash, save_checkpoint
+from pipeline.checkpoints import CheckpointInfo, checkpoint_hash
 from pipeline.config import config_as_dict
 from pipeline.estimators.fitting import FittingData
 from pipeline.estimators.presets import load_estimator
 from pipeline.estimators.samplings import GeneralSampling, Samplings
 from pipeline.files import hash_file
 from pipeline.grids import GridConfig, plan_grid
-from pipeline.infer import draws, stage
+from pipeline.infer import draws, writing
 from pipeline.infer.config import InferConfig
 from pipeline.infer.draws import draw_windows
 from pipeline.infer.stage import infer
@@ -31,6 +30,7 @@ from pipeline.manifest import StageResult, read_manifest
 from pipeline.obstacle_file import read_obstacles
 from pipeline.progress import Progress
 from pipeline.tables import Frame, read_table, write_table
+from pipeline.weights import save_checkpoint
 from pipeline.windows import build_windows
 from schemas.tables import DETECTIONS, WINDOWS, hypotheses_schema
 
@@ -271,8 +271,8 @@ def test_detections_that_need_more_than_the_stated_speed_say_how_much(tmp_path: 
 def test_what_takes_long_says_how_long(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(stage, "_FIRST_S", -1.0)
-    monkeypatch.setattr(stage, "_LONG_S", -1.0)
+    monkeypatch.setattr(writing, "_FIRST_S", -1.0)
+    monkeypatch.setattr(writing, "_LONG_S", -1.0)
     infer(mission(tmp_path), CONFIG, Progress(), num_threads=1)
     assert "infer: 5 windows, about 0 min by the first ones" in capsys.readouterr().err
 

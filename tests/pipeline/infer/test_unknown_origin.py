@@ -24,9 +24,9 @@ from fixtures.unknown_origin import (
 
 from cadence.association.types import AssociationConfig, AssociationHypotheses
 from cadence.constraints.obstacles import Obstacles
-from cadence.diffusion.absolute import AbsoluteSampling
+from cadence.diffusion.settings import AbsoluteSampling
 from cadence.errors import InputError
-from cadence.evidence.estimator import WeighingConfig
+from cadence.evidence.settings import WeighingConfig
 from cadence.types import Detections, HypothesisSet, WindowBatch
 from pipeline import associations
 from pipeline.associations import AssociatedWindows, DataAssociation, build_associated_windows, shared_out, tell_sources
@@ -38,7 +38,8 @@ from pipeline.infer.draws import draw_associations
 from pipeline.infer.stage import infer
 from pipeline.logs.reader import open_log
 from pipeline.progress import Progress, RelayedProgress
-from pipeline.report.stage import ReportConfig, report
+from pipeline.report.config import ReportConfig
+from pipeline.report.stage import report
 from pipeline.results import read_hypothesis_tables
 from pipeline.tables import Frame, read_table, write_table
 from pipeline.tracks import UNKNOWN_AGENT
@@ -153,7 +154,7 @@ def test_hypotheses_pass_through_the_detections_of_their_association(tmp_path: P
 def test_that_many_detections_have_no_name_is_said_before_one_waits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     told: list[object] = []
     for most in (16, 15):
-        monkeypatch.setattr("pipeline.infer.stage._MANY_NAMELESS", most)
+        monkeypatch.setattr("pipeline.infer.writing._MANY_NAMELESS", most)
         infer(mission(tmp_path / str(most), detections()), CONFIG, RelayedProgress(tell=told.append))
     (note,) = [line for line in told if isinstance(line, str) and "do not say whose they are" in line]
     assert note.startswith("infer: 16 detections") and 'agent = "NAME"' in note

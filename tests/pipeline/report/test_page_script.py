@@ -13,7 +13,8 @@ from fixtures.browser import Browser, NoBrowser, Page, chromium
 from fixtures.mission import GEOREFERENCED, build_mission, make_uncertain, rename_agents
 
 from pipeline.progress import Progress
-from pipeline.report.stage import ReportConfig, report
+from pipeline.report.config import ReportConfig
+from pipeline.report.stage import report
 from pipeline.tables import read_table, write_table
 
 Open = Callable[..., Page]

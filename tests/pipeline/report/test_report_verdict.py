@@ -16,9 +16,10 @@ from pipeline.evaluate.stage import EvaluateConfig, evaluate
 from pipeline.infer.stage import infer
 from pipeline.progress import Progress
 from pipeline.report.analysis import analyse, choose_moments
+from pipeline.report.config import ReportConfig
 from pipeline.report.mission import load_mission
 from pipeline.report.scored import Scored, score_mission, truth_of
-from pipeline.report.stage import ReportConfig, report
+from pipeline.report.stage import report
 from pipeline.report.truth import QUICK, truth_section
 from pipeline.report.verdict import verdict_section
 from pipeline.tables import Frame, read_table, write_table

@@ -9,14 +9,15 @@ import torch
 from fixtures.killed_training import Killed, Killer
 
 from cadence.constraints.obstacles import Obstacles
-from cadence.diffusion.absolute import AbsoluteConfig, AbsoluteSampling
+from cadence.diffusion.absolute import AbsoluteConfig
+from cadence.diffusion.settings import AbsoluteSampling
 from cadence.errors import ConfigError, InputError
 from cadence.network.trajectory import TrajectoryNetwork, TrajectoryNetworkConfig
 from cadence.recordings import Recordings, cut_windows
 from cadence.training.absolute import forecast_rows
 from cadence.training.loop import OptimiserConfig
 from cadence.worlds.patrol import PatrolConfig, simulate_patrol
-from pipeline.checkpoints import CheckpointInfo, read_info, save_checkpoint
+from pipeline.checkpoints import CheckpointInfo, read_info
 from pipeline.config import config_as_dict, read_config
 from pipeline.episodes.pool import EpisodeSource
 from pipeline.episodes.recordings import RecordingsConfig, save_recordings
@@ -30,6 +31,7 @@ from pipeline.train.config import AbsoluteTraining, TrainConfig
 from pipeline.train.missions import mission_of_episode, missions_of_logs
 from pipeline.train.paper import draw_windows, mission_windows
 from pipeline.train.stage import train
+from pipeline.weights import save_checkpoint
 from pipeline.windows import build_windows
 
 QUIET = Progress(quiet=True)

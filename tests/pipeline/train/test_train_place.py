@@ -10,9 +10,8 @@ import pytest
 import torch
 from fixtures.killed_training import Killed, Killer
 
-from cadence.diffusion.feasible import GuidanceConfig
-from cadence.diffusion.place import PlaceSampling
 from cadence.diffusion.place_frame import PlaceConfig
+from cadence.diffusion.settings import GuidanceConfig, PlaceSampling
 from cadence.errors import ConfigError, InputError
 from cadence.network.place import PlaceNetworkConfig
 from cadence.recordings import Recordings, cut_windows

@@ -14,7 +14,7 @@ from cadence.baselines.vrnn import VrnnNetworkConfig
 from cadence.errors import ConfigError
 from cadence.recordings import Recordings, choose_windows, cut_windows
 from cadence.training.loop import OptimiserConfig
-from pipeline.checkpoints import read_info, read_note
+from pipeline.checkpoints import read_info
 from pipeline.config import read_config
 from pipeline.episodes.recordings import RecordingsConfig, save_recordings
 from pipeline.estimators.mixtures import load_rival
@@ -22,6 +22,7 @@ from pipeline.progress import Progress
 from pipeline.train.config import RivalTraining, TrainConfig
 from pipeline.train.rivals import train_rival
 from pipeline.train.stage import train
+from pipeline.weights import read_note
 
 QUIET = Progress(quiet=True)
 HISTORY = HistoryConfig(max_detections=12, tracker_steps=4)

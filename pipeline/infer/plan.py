@@ -1,0 +1,134 @@
+"""What is to be drawn of a log: its windows, the estimator that fits it, and what is said of both."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from cadence.association.counts import stream_counts
+from cadence.association.types import AssociationConfig
+from cadence.constraints.obstacles import Obstacles
+from cadence.errors import ImplausibleInputError
+from cadence.evidence.estimator import WithEvidence
+from cadence.types import Evidence
+from pipeline.associations import AssociatedWindows, Sources, build_associated_windows, tell_sources
+from pipeline.checkpoints import DEFAULT
+from pipeline.estimators.fit_test import FitTest, fit_test
+from pipeline.estimators.fitting import FittingData
+from pipeline.estimators.loaded import Loaded
+from pipeline.estimators.presets import load_estimator
+from pipeline.infer.config import InferConfig
+from pipeline.infer.draws import Piece, draw_associations, draw_tracks, draw_windows
+from pipeline.stream_words import stream_words
+from pipeline.suspicions import Suspicions
+from pipeline.windows import MissionWindows, build_windows
+
+
+@dataclass(frozen=True, eq=False)
+class Beside:
+    """What is known of a mission beside its detections: when it began, its obstacles, what else speaks about tracks."""
+
+    start_ns: int
+    obstacles: Obstacles
+    evidence: tuple[Evidence, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """The windows, by name; `associated` where they have several association hypotheses."""
+
+    sources: Sources
+    named: MissionWindows
+    associated: AssociatedWindows | None
+
+    @staticmethod
+    def of(config: InferConfig, detections: pa.Table, loaded: Loaded) -> "Seen":
+        """The windows of a log on the grid that the model takes."""
+        sigma_m, association = config.default_sigma_m, config.association if config.is_associated else None
+        grid = loaded.grid(config.grid)
+        sources = tell_sources(detections, grid, association, config.seed, sigma_m, config.guidance.max_speed_mps)
+        named = build_windows(sources.named, sources.grid, config.seed, sigma_m)
+        if sources.association is None:
+            return Seen(sources, named, None)
+        associated = build_associated_windows(detections, sources, config.seed, config.num_hypotheses, sigma_m)
+        return Seen(sources, named, associated)
+
+    def about(self, config: AssociationConfig) -> dict[str, Any]:
+        """What the summary says of detections of unknown origin; empty where there are none."""
+        association = self.sources.association
+        if association is None:
+            return {}
+        at_origins = association.at_origins
+        time_s = association.stream.time_ns[: at_origins[-1].num_detections].astype(np.float64) * 1e-9
+        return {
+            "association": {
+                "num_detections": len(association.stream),
+                "num_agents": len(association.agent_ids),
+                "mean_num_associations": sum(one.num_associations for one in at_origins) / len(at_origins),
+                "counts": asdict(stream_counts(at_origins[-1], time_s)),
+                "stated": [name for name in ("num_agents", "clutter_share") if getattr(config, name) is not None],
+            }
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """What is to be drawn: the windows, the draws as they come, and what the summary says of the model."""
+
+    checkpoint: str
+    seen: Seen
+    draws: Iterator[Piece]
+    about: Mapping[str, Any]
+    suspicions: Suspicions
+    max_speed_mps: float | None
+    has_evidence: bool
+
+    @property
+    def found(self) -> list[str]:
+        """What a stream without identity turned out to be, in words."""
+        words = stream_words(self.about.get("association", {}))
+        return [words] if words else []
+
+    @staticmethod
+    def of(config: InferConfig, detections: pa.Table, beside: Beside) -> "Plan":
+        """The draws of a log by the checkpoint, which decides the grid as well, or by the default one where it does not fit."""
+        loaded = load_estimator(config.checkpoint, config.samplings)
+        seen = Seen.of(config, detections, loaded)
+        data = FittingData.of(seen.sources.named, seen.sources.grid, seen.named, config.default_sigma_m)
+        suspicions, about = Suspicions(), seen.about(config.association)
+        if config.is_tested and loaded.fit is None:
+            test = fit_test(loaded.estimator, data, seen.named.located(beside.start_ns, beside.obstacles))
+            if test is not None and test.is_misfit:
+                _suspect(test, config, suspicions)
+                plan = Plan.of(replace(config, checkpoint=DEFAULT), detections, beside)
+                return replace(plan, suspicions=suspicions, about={**plan.about, "fit_test": asdict(test)})
+            about["fit_test"] = None if test is None else asdict(test)
+        fitted = loaded.fitted(data)
+        num, evidence = config.num_hypotheses, beside.evidence if config.evidence.is_used else ()
+        if seen.associated is None:
+            weighed = WithEvidence(fitted.estimator, config.evidence, loaded.is_apart, loaded.num_past)
+            located = seen.named.located(beside.start_ns, beside.obstacles, evidence)
+            draws = draw_windows(weighed, located, num, loaded.is_apart)
+        else:
+            associated = seen.associated.located(beside.start_ns, beside.obstacles, evidence)
+            draw = draw_tracks if loaded.is_apart else draw_associations
+            draws = draw(fitted.estimator, associated, num, config.evidence)
+        about = {**fitted.about, **about}
+        return Plan(config.checkpoint, seen, draws, about, suspicions, config.guidance.max_speed_mps, bool(evidence))
+
+    @property
+    def windows(self) -> MissionWindows:
+        """What the tables speak of."""
+        return self.seen.named if self.seen.associated is None else self.seen.associated.windows
+
+
+def _suspect(test: FitTest, config: InferConfig, suspicions: Suspicions) -> None:
+    """Say that the checkpoint is of another place; `ImplausibleInputError` where that is to be refused."""
+    suspicions.add(
+        "checkpoint", config.checkpoint, seen=f"it does not fit this log: {test}",
+        done=f"hypotheses are drawn with {DEFAULT!r} instead", setting="infer.is_tested = false",
+    )  # fmt: skip
+    if config.is_strict:
+        raise ImplausibleInputError(f"infer: refused by --strict, as something is suspected: {suspicions.lines()[0]}")

@@ -1,0 +1,25 @@
+"""What a page is made of."""
+
+from pathlib import Path
+
+from pipeline.missions import CATALOGUE_NAME, no_mission
+from pipeline.obstacle_file import OBSTACLES_NAME
+
+STAGES = ("ingest", "extract", "infer", "export", "evaluate")
+"""Stages whose manifests the page shows, in the order of the work."""
+
+
+def mission_inputs(directory: Path) -> list[Path]:
+    """The files of `directory` that the page depends on, as far as they exist; `InputError` for no mission directory."""
+    if not (directory / CATALOGUE_NAME).is_file():
+        raise no_mission(directory)
+    names = [CATALOGUE_NAME, "detections.parquet", "hypotheses.parquet", "windows.parquet", OBSTACLES_NAME]
+    names += [
+        "associations.parquet",
+        "labels.parquet",
+        "truth.parquet",
+        "poses.parquet",
+        "scores.json",
+        *(f"{stage}.manifest.json" for stage in STAGES),
+    ]
+    return [directory / name for name in names if (directory / name).is_file()]
