@@ -338,6 +338,121 @@ def evaluate(
     _show(evaluate_any(mission, checkpoint, out, resolved, Progress(quiet), force), as_json)
 
 
+questions = typer.Typer(
+    name="ask",
+    add_completion=False,
+    rich_markup_mode=None,
+    no_args_is_help=True,
+    help="""Ask where it was, when it arrived, whether two met.
+
+    Answers come from mission hypotheses (given all that was detected), or with --as-of from what was known at a moment. AREA is
+    a GeoJSON file or text, a circle `latitude,longitude,metres` (`x,y,metres` where the log is not georeferenced), or the name
+    of an obstacle; LINE likewise, or two points and more. Times are ISO 8601, a time of day (UTC), or seconds after the log
+    begins.
+
+    \b
+    Examples:
+      cadence ask results/flight where --at 10:12:30 --out places
+      cadence ask results/flight inside 50.76,-1.29,2000 --from 10:00 --to 11:00 --dwell 600
+      cadence ask results/flight meet --within 500 --for 60 --json
+    """,
+)
+app.add_typer(questions, name="ask")
+_MINUS = {"ignore_unknown_options": True}  # southern latitudes begin with a minus
+OneAgent = Annotated[str | None, typer.Option("--agent", metavar="NAME", help="Only this agent; default: each.")]
+From = Annotated[str | None, typer.Option("--from", metavar="T", help="Not before T; default: the beginning.")]
+To = Annotated[str | None, typer.Option("--to", metavar="T", help="Not after T; default: the end.")]
+AsOf = Annotated[str | None, typer.Option("--as-of", metavar="T", help="From what was known at T, not from all.")]
+Area = Annotated[str, typer.Argument(metavar="AREA", help="GeoJSON, a circle, or an obstacle's name.", show_default=False)]
+
+
+@questions.callback()
+def _ask(context: typer.Context, mission: Mission) -> None:
+    context.obj = mission
+
+
+def _answer(context: typer.Context, as_json: bool, out: Path | None = None, **stated: object) -> None:
+    from pipeline.ask.question import Question
+    from pipeline.ask.spoken import ask
+
+    typer.echo(ask(context.obj, Question.asked(**stated), out, as_json))
+
+
+@questions.command()
+def where(
+    context: typer.Context, at: Annotated[str, typer.Option("--at", metavar="T", help="The moment.", show_default=False)],
+    agent: OneAgent = None, as_of: AsOf = None,
+    out: Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Write GeoJSON, GeoTIFF and a map there.")] = None,
+    as_json: Json = False,
+) -> None:  # fmt: skip
+    """Where it was: areas that hold 50, 90 and 95 %."""
+    _answer(context, as_json, out, ask="where", at=at, agent=agent, as_of=as_of)
+
+
+@questions.command(context_settings=_MINUS)
+def inside(
+    context: typer.Context, area: Area, start: From = None, end: To = None,
+    dwell: Annotated[float, typer.Option("--dwell", metavar="S", help="For so many seconds without a break.")] = 0.0,
+    agent: OneAgent = None, as_of: AsOf = None, as_json: Json = False,
+) -> None:  # fmt: skip
+    """Whether it was in AREA, since when, until when."""
+    _answer(context, as_json, ask="inside", area=area, start=start, end=end, dwell_s=dwell, agent=agent, as_of=as_of)
+
+
+@questions.command(context_settings=_MINUS)
+def arrive(
+    context: typer.Context, area: Area, start: From = None, end: To = None, agent: OneAgent = None, as_of: AsOf = None,
+    as_json: Json = False,
+) -> None:  # fmt: skip
+    """Whether it came into AREA from outside, when, and where over its border."""
+    _answer(context, as_json, ask="arrive", area=area, start=start, end=end, agent=agent, as_of=as_of)
+
+
+@questions.command(context_settings=_MINUS)
+def passed(
+    context: typer.Context,
+    line: Annotated[str, typer.Argument(metavar="LINE", help="GeoJSON, or points 'A,B C,D'.", show_default=False)],
+    start: From = None, end: To = None, agent: OneAgent = None, as_of: AsOf = None, as_json: Json = False,
+) -> None:  # fmt: skip
+    """Whether it crossed LINE, when, where, and to which side."""
+    _answer(context, as_json, ask="passed", line=line, start=start, end=end, agent=agent, as_of=as_of)
+
+
+@questions.command()
+def meet(
+    context: typer.Context,
+    agents: Annotated[list[str] | None, typer.Argument(metavar="A B", help="Two agents; default: all pairs.")] = None,
+    within: Annotated[float, typer.Option("--within", metavar="M", help="Metres.", show_default=False)] = ...,  # type: ignore[assignment]
+    during: Annotated[float, typer.Option("--for", metavar="S", help="Seconds without a break.")] = 0.0,
+    start: From = None, end: To = None, as_of: AsOf = None, as_json: Json = False,
+) -> None:  # fmt: skip
+    """Whether two came within M metres of each other, when and where."""
+    one, other = [*(agents or ()), None, None][:2]
+    if len(agents or ()) > 2:
+        raise UsageError("meet is about two agents, or about all")
+    _answer(
+        context, as_json, ask="meet", agent=one, other=other, within_m=within, for_s=during, start=start, end=end, as_of=as_of
+    )
+
+
+@questions.command()
+def same(
+    context: typer.Context,
+    one: Annotated[str, typer.Argument(metavar="A", help="An agent, or #N: row N of the detections.", show_default=False)],
+    other: Annotated[str, typer.Argument(metavar="B", help="Another one.", show_default=False)],
+    within: Annotated[float | None, typer.Option("--within", metavar="M", help="Further apart they are two.")] = None,
+    as_of: AsOf = None, as_json: Json = False,
+) -> None:  # fmt: skip
+    """How likely two detections, or two tracks, are of one target."""
+    _answer(context, as_json, ask="same", agent=one, other=other, within_m=within, as_of=as_of)
+
+
+@questions.command()
+def searched(context: typer.Context, as_json: Json = False) -> None:
+    """How much of where it may have been the sensors swept; needs their footprints."""
+    _answer(context, as_json, ask="searched")
+
+
 @app.command()
 def view(
     target: ViewTarget, out: ViewOut = "results", served: Served = False, port: Port = 0, config: Config = None,

@@ -25,8 +25,9 @@ from pipeline.mapping.message_types import MESSAGE_TYPES
 
 COMMANDS = (
     "info", "doctor", "import", "run", "ingest", "extract", "infer", "export", "report", "evaluate", "view",
-    "simulate", "train",
+    "simulate", "train", "ask",
 )  # fmt: skip
+QUESTIONS = ("where", "inside", "arrive", "passed", "meet", "same", "searched")
 
 CLI_INTRODUCTION = """# Command line
 
@@ -69,6 +70,8 @@ def cli_page() -> str:
     parts = [CLI_INTRODUCTION, "## cadence\n", _help([])]
     for command in COMMANDS:
         parts += [f"## cadence {command}\n", _help([command])]
+    for question in QUESTIONS:
+        parts += [f"### cadence ask MISSION {question}\n", _help(["ask", "MISSION", question])]
     return "\n".join(parts)
 
 

@@ -10,6 +10,9 @@ import pyarrow as pa
 
 from cadence.constraints.obstacles import Obstacles
 from cadence.errors import InputError
+from pipeline.ask.answers import Answer, answers
+from pipeline.ask.known import Known, open_known
+from pipeline.ask.question import Question
 from pipeline.batch.config import RunConfig
 from pipeline.batch.outcome import LogOutcome
 from pipeline.batch.run import run
@@ -48,6 +51,14 @@ class Mission:
     def frame(self) -> Frame:
         """The mission frame: x east, y north, metres about its datum."""
         return read_table(self.path / "detections.parquet", "detections")[1]
+
+    def ask(self, question: Question) -> tuple[Answer, ...]:
+        """What the mission hypotheses say to a question, an answer for each agent or pair; see `cadence ask --help`."""
+        return answers(self._known if question.as_of is None else open_known(self.path, question.as_of), question)
+
+    @cached_property
+    def _known(self) -> Known:
+        return open_known(self.path)
 
     def table(self, name: str) -> pa.Table:
         """An Arrow table (docs/formats.md): detections, truth, poses, hypotheses, windows, associations or labels."""

@@ -17,11 +17,11 @@ from pipeline.progress import Progress
 ROOT = Path(__file__).resolve().parents[1]
 COMMANDS = (
     "info", "doctor", "import", "run", "ingest", "extract", "infer", "export", "report", "evaluate", "view",
-    "simulate", "train",
+    "simulate", "train", "ask",
 )  # fmt: skip
 
 
-NO_STAGES = ("info", "doctor", "import", "view")  # these have no settings in files
+NO_STAGES = ("info", "doctor", "import", "view", "ask")  # these have no settings in files
 
 
 def test_help_names_every_command(capsys):
@@ -37,7 +37,12 @@ def test_help_of_each_command_is_complete(command, capsys):
     text = capsys.readouterr().out
     assert f"Usage: cadence {command}" in text
     assert re.search(rf"Examples?:\n +cadence {command} ", text)
-    options = re.findall(r"^ +(?:-q, )?(--[a-z-]+)", text, flags=re.MULTILINE)
+    described = text
+    if command == "ask":  # its examples are questions, which have options of their own
+        for question in ("where", "inside", "meet"):
+            assert cli.main(["ask", "MISSION", question, "--help"]) == 0
+            described += capsys.readouterr().out
+    options = re.findall(r"^ +(?:-q, )?(--[a-z-]+)", described, flags=re.MULTILINE)
     for option in re.findall(r"--[a-z][a-z-]+", text.split("Options:")[0]):
         assert option in options, f"an example uses {option}, which {command} does not have"
 

@@ -111,6 +111,9 @@ def assert_accepted(words: list[str], line: str) -> None:
         context = command.make_context(words[0], list(words[1:]))
     except typer.TyperException as error:
         raise AssertionError(f"{line}: {error.format_message()}") from error
+    if words[0] == "ask" and len(words) > 2:
+        assert words[2] in command.commands, line
+        command.commands[words[2]].make_context(words[2], list(words[3:]))
     assert_tables_fit(merge_overrides({}, context.params.get("settings") or ()), line)
 
 
@@ -128,7 +131,8 @@ def test_configuration_examples_are_accepted(page):
 
 @every_page
 def test_flags_and_settings_in_sentences_exist(page):
-    known_flags = {flag for command in COMMANDS.values() for option in command.params for flag in option.opts}
+    commands = [*COMMANDS.values(), *COMMANDS["ask"].commands.values()]
+    known_flags = {flag for command in commands for option in command.params for flag in option.opts}
     known_flags |= {"--version", "--help"}
     for words in quoted(page.read_text(encoding="utf-8")):
         flag = re.match(r"--[a-z-]+", words)

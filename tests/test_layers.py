@@ -57,7 +57,7 @@ FLOORS = {
         {"missions", "checkpoints", "grids", "results", "stories"},
         {"weights", "windows"},
         {"catalogue", "associations"},
-        {"estimators", "scoring"},
+        {"ask", "estimators", "scoring"},
         {"ingest", "extract", "infer", "export", "report", "simulate", "importing"},  # no stage imports another
         {"episodes"},
         {"forecast", "train"},
@@ -190,8 +190,8 @@ def test_exceptions_from_the_limits_are_needed():
 
 
 def test_command_line_stays_thin():
-    # most of it is help: a docstring with examples for each of the commands
-    assert len((ROOT / "cli.py").read_text(encoding="utf-8").splitlines()) < 500
+    # most of it is help: one function and its help a command, and a question of `cadence ask` is one
+    assert len((ROOT / "cli.py").read_text(encoding="utf-8").splitlines()) < 620
 
 
 def test_top_level_is_what_the_plan_says():

@@ -1,0 +1,64 @@
+"""One call of `cadence ask`: a question to a mission directory, its answers as text, as JSON and as files."""
+
+import dataclasses
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from cadence.errors import UsageError
+from pipeline.ask.answers import Answer, answers, refuse_unanswerable
+from pipeline.ask.files import write_places
+from pipeline.ask.known import Known, open_known
+from pipeline.ask.question import Question
+from pipeline.ask.words import area_words
+from pipeline.lengths import metres
+
+_MANY = 20
+
+
+def ask(directory: Path, question: Question, out: Path | None = None, as_json: bool = False) -> str:
+    """The answers of the results in `directory` as text, or as JSON; with `out`, files of areas are written there."""
+    if out is not None and question.ask != "where":
+        raise UsageError(f"--out is for `where`, which has areas to write; `{question.ask}` has none")
+    refuse_unanswerable(directory, question)
+    known = open_known(directory, question.as_of)
+    found = answers(known, question)
+    paths = write_places(known, found, out) if out is not None else ()
+    return _as_json(known, question, found, paths) if as_json else _as_text(known, found, paths)
+
+
+def _as_text(known: Known, found: Sequence[Answer], paths: Sequence[Path]) -> str:
+    """One sentence an answer, its numbers below it, and what they rest on."""
+    lines = []
+    for answer in found[:_MANY]:
+        lines += [answer.sentence, *(f"  {line}" for line in _sizes(answer))]
+    if len(found) > _MANY:
+        lines.append(f"{len(found) - _MANY} more; --json has all")
+    stories = known.stories
+    effective = 1.0 / float((stories.weight**2).sum())
+    equal = "" if effective > 0.99 * stories.num_hypotheses else f", of unequal weight, as good as {effective:.0f} equal ones"
+    moment = "" if known.as_of_ns is None else f" as of {known.clock.moment(known.as_of_ns)}"
+    lines.append(f"From {stories.num_hypotheses} stories{equal}{moment}; in brackets what more of them could say.")
+    return "\n".join([*lines, *map(str, paths)])
+
+
+def _sizes(answer: Answer) -> list[str]:
+    """What does not fit into the sentence of `where`."""
+    if answer.place is None:
+        return []
+    sizes = ", ".join(
+        f"{100 * area.level:g} %: {area_words(area.area_m2)} ({area_words(area.low_m2)} to {area_words(area.high_m2)})"
+        for area in answer.place.areas
+    )
+    return [sizes, f"mean distance from the middle {metres(answer.place.spread_m)}"]
+
+
+def _as_json(known: Known, question: Question, found: Sequence[Answer], paths: Sequence[Path]) -> str:
+    stated: dict[str, Any] = {key: value for key, value in dataclasses.asdict(question).items() if value is not None}
+    content = {
+        "question": stated, "log_id": known.mission.log_id, "as_of_ns": known.as_of_ns,
+        "num_stories": known.stories.num_hypotheses, "answers": [answer.record() for answer in found],
+        "files": [str(path) for path in paths],
+    }  # fmt: skip
+    return json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False)
