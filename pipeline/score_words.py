@@ -10,6 +10,7 @@ ESTIMATORS: Final[Mapping[str, str]] = {
     "ou": "fading velocity",
     "linear": "straight lines",
     "hold": "stays where seen",
+    "ring": "distance rings",
 }
 """Rivals of `cadence evaluate`; others are called by their names."""
 

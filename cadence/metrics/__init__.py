@@ -6,6 +6,7 @@ Shapes everywhere: hypotheses position_m [B, K, A, T, 2], weight [B, K] (rows su
 
 from cadence.metrics.bootstrap import Interval, bootstrap_mean, bootstrap_ratio
 from cadence.metrics.calibration import coverage, density_rank
+from cadence.metrics.map_score import map_density, map_score, ring_density
 from cadence.metrics.position import ade, expected_distance, masked_mean, mean_error, min_ade, min_ade_distance, spread
 from cadence.metrics.scores import energy_score, trajectory_energy_score
 from cadence.metrics.sets import Gospa, gospa, ospa
@@ -21,11 +22,14 @@ __all__ = [
     "energy_score",
     "expected_distance",
     "gospa",
+    "map_density",
+    "map_score",
     "masked_mean",
     "mean_error",
     "min_ade",
     "min_ade_distance",
     "ospa",
+    "ring_density",
     "spread",
     "trajectory_energy_score",
 ]

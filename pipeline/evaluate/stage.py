@@ -18,6 +18,7 @@ from cadence.errors import CadenceError, InputError, UsageError
 from cadence.types import Estimator, WindowBatch
 from pipeline.estimators.fitting import FittingData
 from pipeline.evaluate.joint import JointCells, JointScorer
+from pipeline.evaluate.maps import RING_NAME, MapCells, MapScorer
 from pipeline.evaluate.rivals import RIVALS
 from pipeline.evaluate.tables import OWN_NAME, ScoredMission, as_csv, as_json, as_markdown, headline, pool, verdict
 from pipeline.files import write_atomic
@@ -145,17 +146,20 @@ def score_mission(directory: Path, config: EvaluateConfig, progress: Progress) -
     obstacles = mission_obstacles(directory)
     collides = collision_test(obstacles, windows)
     truth = true_motion(scored, case.truth_m, case.is_known)
+    maps = MapScorer.of(scored, case.truth_m, case.is_known, windows.datum_m)
+    mapped: dict[str, MapCells] = {}
     with progress.bar(windows.batch.num_windows * (1 + len(config.rivals)), "evaluate", "window") as bar:
 
-        def score(draw: Draw, is_known: Tensor) -> tuple[Cells, JointCells, MotionLaws]:
-            scorer, motion = _scorer(case), truth.fresh()
-            watched = motion.watch(scorer.watch(draw) if case.is_joint else draw)
+        def score(name: str, draw: Draw, is_known: Tensor) -> tuple[Cells, JointCells, MotionLaws]:
+            scorer, motion, on_map = _scorer(case), truth.fresh(), maps.fresh()
+            watched = on_map.watch(motion.watch(scorer.watch(draw) if case.is_joint else draw))
             cells = score_in_chunks(
                 watched, scored, case.truth_m, is_known, num_hypotheses, collides, bar.update, truth.fastest_m
             )
+            mapped[name] = on_map.cells()
             return cells, scorer.cells(), motion.laws()
 
-        own_scored = score(case.draw, case.is_known)
+        own_scored = score(OWN_NAME, case.draw, case.is_known)
         own = own_scored[0]
         if not len(own):
             raise InputError(
@@ -167,7 +171,7 @@ def score_mission(directory: Path, config: EvaluateConfig, progress: Progress) -
         found: dict[str, tuple[Cells, JointCells, MotionLaws]] = {OWN_NAME: own_scored}
         for name in config.rivals:
             draw = _rival_draw(RIVALS[name](fitting), windows.batch, num_hypotheses)
-            found[name] = score(draw, case.is_known & is_scored[..., None])
+            found[name] = score(name, draw, case.is_known & is_scored[..., None])
             if len(found[name][0]) != len(own):
                 raise ValueError(f"{name} scored {len(found[name][0])} cells where {OWN_NAME} scored {len(own)}")
     is_asked = case.is_known.any(dim=-1) & scored.is_active
@@ -183,6 +187,7 @@ def score_mission(directory: Path, config: EvaluateConfig, progress: Progress) -
         joint={name: joint for name, (_, joint, _) in found.items()} if case.is_joint else {},
         motion={name: laws for name, (_, _, laws) in found.items()},
         true_motion=truth.laws(),
+        maps={**mapped, RING_NAME: maps.rings()},
         gospa_cutoff_m=case.cutoff_m if case.is_joint else None,
         is_matched=case.is_matched,
         true_collision_share=_collision_share(collision_test(obstacles, windows, are_ways_straight=False), case),

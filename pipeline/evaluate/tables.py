@@ -12,6 +12,7 @@ import numpy as np
 from cadence.arrays import Int64s
 from pipeline.counted import counted
 from pipeline.evaluate.joint import JOINT_METRICS, JointCells, block_of, summarise_joint
+from pipeline.evaluate.maps import MapCells, map_rows
 from pipeline.plain_rows import rows_as_csv, without_nan
 from pipeline.score_words import coverage_words, estimator_words
 from pipeline.scoring.motion import MotionLaws, MotionSample, motion_rows
@@ -26,6 +27,7 @@ _PART_METRICS = {
     "energy_score_m": "energy score m", "trajectory_energy_score_m": "trajectory energy m", "ade_m": "ADE m",
     "min_ade_m": "minADE m", "mean_error_m": "error of mean m", "coverage_50": "in 50 %", "coverage_90": "in 90 %",
     "spread_m": "spread m", "step_length_m": "step m", "true_step_length_m": "true step m", "collision_share": "collisions",
+    "map_score": "MapScore",
 }  # fmt: skip
 _MOTION_TITLES = {
     "speed_w1_mps": "speed m/s", "acceleration_w1_mps2": "acceleration m/s²", "turn_w1_deg": "turn a step °",
@@ -53,6 +55,7 @@ class ScoredMission:
     true_collision_share  of the steps of the truth, those that lie in an obstacle; None without obstacles
     motion, true_motion  how hypotheses move, by estimator, and how the truth does
     joint         by estimator, scores of all agents together; empty for one agent
+    maps          by estimator and of the distance rings, MapScore of some cells
     is_matched    detections are of unknown origin: agents were matched to those of the truth
     """
 
@@ -70,6 +73,7 @@ class ScoredMission:
     motion: dict[str, MotionLaws] = field(default_factory=dict)
     true_motion: MotionLaws = field(default_factory=dict)
     true_collision_share: float | None = None
+    maps: dict[str, MapCells] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -122,6 +126,8 @@ def pool(missions: Sequence[ScoredMission], num_resamples: int, seed: int) -> Sc
     rows = [row for name in names for row in summarise(name, cells[name], groups, seed, num_resamples)]
     rows += _joint_rows(missions, names, num_resamples, seed)
     rows += _motion_rows(missions, names)
+    mapped = [(mission.maps, mission.num_windows) for mission in missions if mission.maps]
+    rows += map_rows(mapped, grouped_by == "log", num_resamples, seed)
     ratios = []
     for rival in names[1:]:
         for part in PARTS:
