@@ -94,6 +94,19 @@ ViewTarget = Annotated[str, typer.Argument(metavar="LOG|RESULTS", help="A log, o
 ViewOut = Annotated[str, typer.Option("--out", metavar="DIR", help="Folder for the results of a log.")]
 Served = Annotated[bool, typer.Option("--serve", help="Serve the folder to this machine, and print the address.")]
 Port = Annotated[int, typer.Option(metavar="N", help="Port to serve at; 0: a free one.")]
+TakeTo = Annotated[
+    list[str] | None, typer.Option("--to", metavar="FORMATS", help="Formats for other programs, with commas; repeatable.")
+]
+TakeOut = Annotated[
+    Path | None, typer.Option("--out", metavar="DIR", help="With --to: folder for the files; default: MISSION.")
+]
+Source = Annotated[
+    Literal["mission", "windows"] | None,
+    typer.Option("--from", help="With --to: mission hypotheses or windows; default: the first that is there."),
+]
+Drawn = Annotated[
+    int | None, typer.Option(metavar="N", help="With --to: hypotheses, the heaviest; default: 30, in GeoParquet all.")
+]
 Checkpoint = Annotated[str | None, typer.Option(metavar="NAME", help="Evaluate its forecasts on the logs in MISSION.")]
 ForecastOut = Annotated[Path | None, typer.Option("--out", metavar="DIR", help="For the forecasts' scores; default: MISSION.")]
 
@@ -280,17 +293,28 @@ def infer(
 
 @app.command()
 def export(
-    mission: Mission, combined: Combined = False, config: Config = None, settings: Set = None, force: Force = False,
-    quiet: Quiet = False, as_json: Json = False,
+    mission: Mission, to: TakeTo = None, out: TakeOut = None, source: Source = None, hypotheses: Drawn = None,
+    combined: Combined = False, config: Config = None, settings: Set = None, force: Force = False, quiet: Quiet = False,
+    as_json: Json = False,
 ) -> None:  # fmt: skip
-    """Stage 4: write the files for Foxglove.
+    """Stage 4: write the files for Foxglove, or others.
 
-    The side file NAME.cadence.mcap, to be opened together with the log, and a layout to import.
+    The side file NAME.cadence.mcap, to be opened together with the log, and a layout to import. With --to nothing of that, but
+    tracks with their times and weights, means, and regions that hold 50 and 90 %; formats: geoparquet, geojson, kml, czml,
+    gpx, cot. All but geoparquet need latitude and longitude.
 
     \b
-    Example:
+    Examples:
       cadence export results/flight --combined
+      cadence export results/flight --to geojson,kml
+      cadence export results/flight --to geoparquet --out tables --from windows
     """
+    if to:
+        from pipeline.takeaway.stage import render, take_away
+
+        taken = take_away(mission, to, out, hypotheses, source, Progress(quiet))
+        typer.echo(to_json(taken) if as_json else render(taken))
+        return
     from pipeline.export.config import ExportConfig
     from pipeline.export.stage import export as stage
 

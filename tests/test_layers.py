@@ -63,7 +63,7 @@ FLOORS = {
         {"forecast", "train"},
         {"evaluate"},
         {"batch", "inspect"},
-        {"front", "view"},
+        {"front", "takeaway", "view"},
     ),
 }
 

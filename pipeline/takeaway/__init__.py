@@ -1,0 +1,1 @@
+"""Results as files that other programs take: GeoParquet, GeoJSON, KML, CZML, GPX, Cursor on Target."""
