@@ -13,6 +13,8 @@ import numpy as np
 from cadence.arrays import Bools, Float64s
 from cadence.measurement.processes import Processes, Transitions, transitions
 
+_BLOCK: Final = 16384
+"""Numbers that are worked on at once: what a filter holds of them stays in the processor's cache."""
 _SPEEDS: Final = 3.0
 """The first velocity of a stretch is free: so many times the root mean square velocity."""
 
@@ -45,15 +47,21 @@ class Stretches:
 
 @dataclass(frozen=True, eq=False)
 class _State:
-    """Mean [..., 2] in fixed axes, covariances [..., 2] along and across the course, of the three states."""
+    """Mean [2, ...] in fixed axes and covariances [2, ...] along and across the course, of position and velocity."""
 
     x: Float64s
     v: Float64s
-    a: Float64s
     xx: Float64s
     xv: Float64s
-    xa: Float64s
     vv: Float64s
+
+
+@dataclass(frozen=True, eq=False)
+class _Turning(_State):
+    """The same with an acceleration."""
+
+    a: Float64s
+    xa: Float64s
     va: Float64s
     aa: Float64s
 
@@ -67,43 +75,65 @@ def log_likelihoods(stretches: Stretches, sigma: Float64s, along: Float64s, proc
         along: [G] what errors in time add along the course at the typical speed.
         processes: the ways to move.
     """
-    shape = (len(stretches.time), len(sigma), len(processes), 2)
     steps = transitions(np.diff(stretches.time, axis=1))
+    found = np.empty((len(stretches.time), len(sigma), len(processes)))
+    for group in (np.flatnonzero(processes.has_acceleration == 0), np.flatnonzero(processes.has_acceleration)):
+        some = processes[group]
+        of_some = Transitions(*(value[:, :, None, some.family] for value in steps))
+        size = max(1, _BLOCK // max(1, 2 * len(stretches.time) * len(some)))
+        for begin in range(0, len(sigma) if len(some) else 0, size):
+            part = slice(begin, begin + size)
+            found[:, part, group] = _of_alike(stretches, sigma[part], along[part], some, of_some)
+    return found
+
+
+def _of_alike(stretches: Stretches, sigma: Float64s, along: Float64s, processes: Processes, steps: Transitions) -> Float64s:
+    """`log_likelihoods` of few noises, under processes of which all or none have an acceleration; steps [S, N - 1, 1, M]."""
+    shape = (2, len(stretches.time), len(sigma), len(processes))
     noise = _noise(stretches, sigma, along)
     zero = np.zeros(shape)
-    aa = zero + (processes.has_acceleration * processes.variance)[:, None]
-    state = _State(zero, zero, zero, zero + noise[:, 0], zero, zero, zero + (_SPEEDS * stretches.velocity) ** 2, zero, aa)
-    found = np.zeros(shape[:-1])
+    state = _State(zero, zero, zero + noise[:, :, 0], zero, zero + (_SPEEDS * stretches.velocity) ** 2)
+    if processes.has_acceleration.any():
+        state = _Turning(**vars(state), a=zero, xa=zero, va=zero, aa=zero + processes.variance)
+    found = np.zeros(shape[1:])
     for number in range(1, stretches.time.shape[1]):
-        step = Transitions(*(value[:, number - 1, processes.family][:, None, :, None] for value in steps))
-        state = _predicted(state, step, processes.variance[:, None])
-        course = stretches.course[:, number][:, None, None]
-        offset = _turned(stretches.position[:, number][:, None, None] - state.x, course)
-        variance = state.xx + noise[:, number]
-        gained = -0.5 * (offset**2 / variance + np.log(variance)).sum(-1)
+        state = _predicted(state, Transitions(*(value[:, number - 1] for value in steps)), processes.variance)
+        course = stretches.course[:, number].T[..., None, None]
+        offset = _turned(stretches.position[:, number].T[..., None, None] - state.x, course)
+        variance = state.xx + noise[:, :, number]
+        gained = -0.5 * (offset**2 / variance + np.log(variance)).sum(0)
         found += np.where(stretches.is_seen[:, number][:, None, None], gained, 0.0)
         state = _updated(state, offset / variance, variance, course)
     return found
 
 
 def _noise(stretches: Stretches, sigma: Float64s, along: Float64s) -> Float64s:
-    """Variance of the detections [S, N, G, 1, 2]: along and across. What noise adds to a speed is no speed."""
+    """Variance of the detections [2, S, N, G, 1]: along and across. What noise adds to a speed is no speed."""
     speed2 = np.maximum(stretches.speed2[..., None] - sigma**2 * stretches.doubt2[..., None], 0.0)
     across = np.broadcast_to(sigma**2, speed2.shape)
-    return np.stack([across + along**2 * speed2, across], -1)[..., None, :]
+    return np.stack([across + along**2 * speed2, across])[..., None]
 
 
 def _turned(vector: Float64s, course: Float64s) -> Float64s:
     """A vector in fixed axes as one along and across the course; the same again turns it back."""
-    east, north = course[..., 0], course[..., 1]
-    return np.stack([east * vector[..., 0] + north * vector[..., 1], north * vector[..., 0] - east * vector[..., 1]], axis=-1)
+    (east, north), (x, y) = course, vector
+    return np.stack([east * x + north * y, north * x - east * y])
 
 
 def _predicted(s: _State, to: Transitions, variance: Float64s) -> _State:
+    if not isinstance(s, _Turning):
+        xv = s.xv + to.x_of_v * s.vv
+        return _State(
+            x=s.x + to.x_of_v * s.v,
+            v=to.v_of_v * s.v,
+            xx=s.xx + to.x_of_v * s.xv + to.x_of_v * xv + to.xx * variance,
+            xv=to.v_of_v * xv + to.xv * variance,
+            vv=to.v_of_v * (to.v_of_v * s.vv) + to.vv * variance,
+        )
     xx, xv = s.xx + to.x_of_v * s.xv + to.x_of_a * s.xa, s.xv + to.x_of_v * s.vv + to.x_of_a * s.va
     xa = s.xa + to.x_of_v * s.va + to.x_of_a * s.aa
     vv, va = to.v_of_v * s.vv + to.v_of_a * s.va, to.v_of_v * s.va + to.v_of_a * s.aa
-    return _State(
+    return _Turning(
         x=s.x + to.x_of_v * s.v + to.x_of_a * s.a,
         v=to.v_of_v * s.v + to.v_of_a * s.a,
         a=to.a_of_a * s.a,
@@ -118,14 +148,19 @@ def _predicted(s: _State, to: Transitions, variance: Float64s) -> _State:
 
 def _updated(s: _State, weighed: Float64s, variance: Float64s, course: Float64s) -> _State:
     of_x, of_v = s.xx / variance, s.xv / variance
-    return _State(
+    moved = _State(
         x=s.x + _turned(s.xx * weighed, course),
         v=s.v + _turned(s.xv * weighed, course),
-        a=s.a + _turned(s.xa * weighed, course),
         xx=s.xx - of_x * s.xx,
         xv=s.xv - of_x * s.xv,
-        xa=s.xa - of_x * s.xa,
         vv=s.vv - of_v * s.xv,
+    )
+    if not isinstance(s, _Turning):
+        return moved
+    return _Turning(
+        **vars(moved),
+        a=s.a + _turned(s.xa * weighed, course),
+        xa=s.xa - of_x * s.xa,
         va=s.va - of_v * s.xa,
         aa=s.aa - s.xa * s.xa / variance,
     )
