@@ -13,6 +13,7 @@ from pipeline.counted import counted
 from pipeline.extract.channel_reader import ChannelReader
 from pipeline.extract.config import ExtractConfig
 from pipeline.extract.fill_ins import without_fill_ins
+from pipeline.extract.frozen import with_rounding, without_frozen
 from pipeline.extract.hemispheres import check_hemispheres
 from pipeline.extract.joined import check_joined
 from pipeline.extract.mission_clock import on_one_clock
@@ -121,7 +122,8 @@ def _in_place(
     found = [
         (reader, in_true_units(reader.source, role, rows, suspicions)) for (reader, _), rows in zip(parts, timed, strict=True)
     ]
-    return [(reader, without_fill_ins(rows, role, suspicions)) for reader, rows in found]
+    filled = [(reader, without_frozen(without_fill_ins(rows, role, suspicions), role, suspicions)) for reader, rows in found]
+    return [(reader, with_rounding(rows, role, reader.source.sigma_m is not None, suspicions)) for reader, rows in filled]
 
 
 def _check_any(role: str, rows: Positions, counts: Counter[str], suspicions: Suspicions) -> None:

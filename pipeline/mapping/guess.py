@@ -154,7 +154,7 @@ def _why_unused(channel: ChannelLike, role: Role | None) -> str | None:
     if _is_setpoint(channel) or _may_be_setpoint(channel.topic):
         return "it may be where a vehicle is told to go"
     if normalise_schema(channel.schema_name) in POLAR:
-        return "ranges and bearings are not used"
+        return "ranges and bearings are not used; tracks or objects of the same radar, in metres, would be"
     if type_of_schema(channel.schema_name) is not None:
         return "what is drawn may be anything"
     return "its type is not known"

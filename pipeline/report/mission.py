@@ -7,6 +7,7 @@ unless a name says otherwise.
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -150,8 +151,15 @@ class Mission:
 
     def presence(self, agent: int) -> float | None:
         """How likely an agent is there, in the window where it is likeliest; None where the log says who was seen."""
-        found = [row.probability for row in self.rows if row.agent == agent and row.probability is not None]
-        return max(found, default=None)
+        return self._presences.get(agent)
+
+    @cached_property
+    def _presences(self) -> dict[int, float]:
+        found: dict[int, float] = {}
+        for row in self.rows:
+            if row.probability is not None:
+                found[row.agent] = max(row.probability, found.get(row.agent, row.probability))
+        return found
 
     @property
     def suspicions(self) -> list[JsonDict]:

@@ -6,7 +6,7 @@ made only of hypotheses that keep together; each way is drawn as one of its hypo
 Letters of the shapes: K hypothesis, T time step, S step of a strand.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
 
@@ -31,6 +31,8 @@ FAR, FAR_A_HYPOTHESIS = 4.0, 30.0
 uniform one 3.5 apart, and the fewer hypotheses there are, the further apart chance puts them."""
 
 _FAR_WHEN_BLOCKED = 2.7
+_TOGETHER = 256
+"""Fans of which the means are held at once."""
 _LEAST_SPREAD = 0.05
 """Of the widest of the fan: ways that are hardly apart need not be told."""
 
@@ -61,7 +63,21 @@ class Strand:
 
 def strands_of(fan: Fan, shape: FanShape, obstacles: Obstacles | None) -> tuple[Strand, ...]:
     """The strands of a fan in the order of time, those of the same steps by falling share."""
-    is_blocked = _is_blocked(shape.mean_m, obstacles)
+    return _strands_where(fan, shape, _are_blocked(shape.mean_m[None], obstacles)[0])
+
+
+def strands_of_all(fans: Sequence[Fan], obstacles: Obstacles | None) -> Iterator[tuple[Fan, tuple[Strand, ...]]]:
+    """Every fan with its strands; obstacles are asked once for many fans of one length."""
+    for begin in range(0, len(fans), _TOGETHER):
+        for _, run in groupby(fans[begin : begin + _TOGETHER], key=lambda fan: fan.offset_m.shape[1]):
+            some = list(run)
+            shapes = [shape_of(fan) for fan in some]
+            blocked = _are_blocked(np.stack([shape.mean_m for shape in shapes]), obstacles)
+            for fan, shape, is_blocked in zip(some, shapes, blocked, strict=True):
+                yield fan, _strands_where(fan, shape, is_blocked)
+
+
+def _strands_where(fan: Fan, shape: FanShape, is_blocked: Bools) -> tuple[Strand, ...]:
     centred = fan.offset_m + (fan.datum_m - shape.mean_m)
     distance = _halves(turned(centred, shape.angle_rad)[0], fan.weight)[0]
     spread_m = shape.spread_m
@@ -105,21 +121,23 @@ def _least_distance(fan: Fan) -> float:
     return FAR + FAR_A_HYPOTHESIS / len(fan.weight)
 
 
-def _is_blocked(mean_m: Float64s, obstacles: Obstacles | None) -> Bools:
-    """Where the line of the means [T, 2] runs through an obstacle."""
+def _are_blocked(mean_m: Float64s, obstacles: Obstacles | None) -> Bools:
+    """Where the lines of the means [F, T, 2] run through an obstacle [F, T]."""
     if obstacles is None or obstacles.count == 0:
-        return np.zeros(len(mean_m), dtype=bool)
+        return np.zeros(mean_m.shape[:2], dtype=bool)
     line = torch.from_numpy(mean_m)
     hit = states_in_collision(line, obstacles).numpy().copy()
     crossing = segments_in_collision(line, obstacles).numpy()
-    hit[1:] |= crossing
-    hit[:-1] |= crossing
+    hit[:, 1:] |= crossing
+    hit[:, :-1] |= crossing
     return np.asarray(hit)
 
 
 def _in_runs(is_apart: Bools, is_blocked: Bools) -> Bools:
     """Steps of ways: in runs that last, or hold a step that is blocked."""
     found = is_apart | is_blocked
+    if not found.any():
+        return found
     for wanted in (False, True):  # first breaks that are too short, then runs
         for value, run in groupby(range(len(found)), key=lambda step: bool(found[step])):
             steps = list(run)

@@ -17,11 +17,10 @@ from pipeline.report.config import ReportConfig
 from pipeline.report.fans import Detail, FanCode, choose_detail, encode_fan
 from pipeline.report.geodesy import fit_geodesy
 from pipeline.report.mission import Mission, load_mission
-from pipeline.report.modes import strands_of
+from pipeline.report.modes import strands_of_all
 from pipeline.report.page import write_page
 from pipeline.report.payload import Payload, build_payload
 from pipeline.report.scored import score_mission
-from pipeline.report.shapes import shape_of
 from pipeline.threads import one_thread
 
 FIXED_BYTES, BYTES_A_POINT, BYTES_A_CELL, BYTES_A_TICK = 300_000, 25, 60, 14
@@ -54,9 +53,10 @@ def _payload(mission: Mission, config: ReportConfig, moments: Sequence[Moment], 
     windows = _shown_windows(mission, detail.num_windows, [mission.fans[moment.fan].window for moment in moments])
     agents = _shown_agents(mission, detail.num_agents, [mission.fans[moment.fan].agent for moment in moments])
     shown_windows, shown_agents, codes = set(windows), set(agents), list[FanCode]()
-    for fan in mission.fans:
-        if fan.window in shown_windows and fan.agent in shown_agents:
-            codes.append(encode_fan(fan, strands_of(fan, shape_of(fan), mission.solid), detail))
+    shown = [fan for fan in mission.fans if fan.window in shown_windows and fan.agent in shown_agents]
+    bar.update(len(mission.fans) - len(shown))
+    for fan, strands in strands_of_all(shown, mission.solid):
+        codes.append(encode_fan(fan, strands, detail))
         bar.update(1)
     geodesy = fit_geodesy(mission.frame, *_extent(mission, codes))
     return build_payload(mission, codes, windows, agents, geodesy, config.max_points, shown_share(mission))

@@ -144,7 +144,9 @@ def test_channels_that_may_hold_detections_are_named(tmp_path: Path) -> None:
     assert found.summary["unused"] == {
         "/lidar/objects (own.ObstacleDetections)": "its type is not known",
         "/fused (own_msgs/msg/TrackedObjectList)": "its type is not known",
-        "/radar/detections (radar_msgs/msg/RadarScan)": "ranges and bearings are not used",
+        "/radar/detections (radar_msgs/msg/RadarScan)": (
+            "ranges and bearings are not used; tracks or objects of the same radar, in metres, would be"
+        ),
         "/viz/targets (visualization_msgs/msg/MarkerArray)": "what is drawn may be anything",
     }
     stated = run(tmp_path, [*rows, pose_row(9.0, 1.0, "/more/contacts/b")], detections=[{"topic": "/contacts/{agent}"}])

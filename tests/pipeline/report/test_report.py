@@ -15,7 +15,7 @@ from fixtures.mission import GEOREFERENCED, build_mission, make_uncertain, renam
 
 from cadence.errors import InputError
 from pipeline.progress import Progress
-from pipeline.report import writing
+from pipeline.report import modes
 from pipeline.report.config import ReportConfig
 from pipeline.report.shapes import shape_of
 from pipeline.report.stage import report
@@ -321,6 +321,6 @@ def test_how_likely_an_agent_is_there_stands_beside_its_name(mission: Path) -> N
 
 def test_only_what_is_shown_is_summed_up(mission: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     seen = []
-    monkeypatch.setattr(writing, "shape_of", lambda fan: seen.append(fan.agent) or shape_of(fan))
+    monkeypatch.setattr(modes, "shape_of", lambda fan: seen.append(fan.agent) or shape_of(fan))
     assert "1 of 2 agents" in Page(make(mission, ReportConfig(max_megabytes=0.05, num_moments=0))).text
     assert len(seen) < 11 and len(set(seen)) == 1

@@ -1,0 +1,80 @@
+"""Positions that were not measured as they stand: repeated while the target went on, or rounded."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fixtures.small_logs import Row, detection, fix
+from test_extract import run
+
+NUM = 120
+
+
+def way(seed: int = 0) -> np.ndarray:
+    """A target that goes on at 8 m/s, with noise of 2 m [N, 2]."""
+    noise = np.random.default_rng(seed).normal(0.0, 2.0, (NUM, 2))
+    return np.column_stack([8.0 * np.arange(NUM), 3.0 * np.sin(np.arange(NUM) / 9.0)]) + noise
+
+
+def seen(place_m: np.ndarray, is_geodetic: bool = False, agent: str | None = "a") -> list[Row]:
+    if is_geodetic:
+        degrees = np.array([48.1, 11.6]) + place_m[:, ::-1] / np.array([111_200.0, 74_300.0])
+        return [fix(float(i), *place, topic="/contacts/a") for i, place in enumerate(degrees.tolist())]
+    more = {} if agent is None else {"agent_id": agent}
+    return [detection(float(i), *place, **more) for i, place in enumerate(place_m.tolist())]
+
+
+@pytest.mark.parametrize(("is_geodetic", "agent"), [(True, "a"), (False, "a"), (False, None)])
+def test_a_position_that_is_repeated_while_the_target_goes_on_is_none(
+    tmp_path: Path, is_geodetic: bool, agent: str | None
+) -> None:
+    place_m = way()
+    place_m[41:80] = place_m[40]
+    found = run(tmp_path, seen(place_m, is_geodetic, agent))
+    assert len(found.detections) == NUM - 39
+    (told,) = found.summary["suspicions"]
+    assert told["kind"] == "place" and told["seen"].startswith(f"39 of {NUM} positions repeat the one before to the last digit")
+    assert len(run(tmp_path, seen(place_m, is_geodetic, agent), trusted=["place"]).detections) == NUM
+
+
+def standing() -> np.ndarray:
+    """It stops, says so exactly, and goes on from there."""
+    place_m = way()
+    place_m[41:80] = place_m[40]
+    place_m[80:] -= place_m[80] - place_m[40] - [8.0, 0.0]
+    return place_m
+
+
+def teleporting() -> np.ndarray:
+    """It is somewhere else afterwards: another target, or carried there."""
+    place_m = way()
+    place_m[41:80] = place_m[40]
+    place_m[80:] += 50_000.0
+    return place_m
+
+
+@pytest.mark.parametrize(
+    "place_m",
+    [standing(), np.repeat(way()[::5], 5, axis=0), np.repeat(way()[::30], 30, axis=0), teleporting(), way()],
+    ids=["stands", "each five times", "each thirty times", "elsewhere", "measured"],
+)
+def test_what_repeats_itself_in_another_way_is_left_as_it_is(tmp_path: Path, place_m: np.ndarray) -> None:
+    found = run(tmp_path, seen(place_m))
+    assert not [told for told in found.summary["suspicions"] if "to the last digit" in told["seen"]]
+
+
+@pytest.mark.parametrize(("decimals", "sigma_m"), [(2, 321.3), (3, 32.13)])
+def test_rounded_degrees_are_as_exact_as_their_decimals(tmp_path: Path, decimals: int, sigma_m: float) -> None:
+    rows = [fix(float(i), round(48.1 + 2e-4 * i, decimals), round(11.6 + 3e-4 * i, decimals)) for i in range(300)]
+    found = run(tmp_path, rows)
+    (told,) = [each for each in found.summary["suspicions"] if "decimals" in each["seen"]]
+    assert told["done"] == f"a standard deviation of {sigma_m:.3g} m is taken"
+    assert np.sqrt(np.median(found.detections["cov_yy_m2"].to_numpy())) == pytest.approx(sigma_m, rel=0.01)
+    stated = run(tmp_path, rows, detections=[{"topic": "/contacts/{agent}", "sigma_m": 50.0}])
+    assert not [each for each in stated.summary["suspicions"] if "decimals" in each["seen"]]
+
+
+@pytest.mark.parametrize("step_deg", [1e-4, 0.0])
+def test_fine_degrees_and_a_target_that_stands_are_not_rounded(tmp_path: Path, step_deg: float) -> None:
+    rows = [fix(float(i), round(48.1 + step_deg * i, 4), round(11.6 + step_deg * i, 4)) for i in range(100)]
+    assert not [each for each in run(tmp_path, rows).summary["suspicions"] if "decimal" in each["seen"]]
