@@ -13,7 +13,6 @@ from pipeline.counted import counted
 from pipeline.extract.channel_reader import ChannelReader
 from pipeline.extract.config import ExtractConfig
 from pipeline.extract.fill_ins import without_fill_ins
-from pipeline.extract.frozen import with_rounding, without_frozen
 from pipeline.extract.hemispheres import check_hemispheres
 from pipeline.extract.joined import check_joined
 from pipeline.extract.mission_clock import on_one_clock
@@ -29,6 +28,7 @@ from pipeline.extract.thinning import ThinningConfig, is_seen, noise
 from pipeline.extract.transform_messages import LogTransforms
 from pipeline.extract.transforms import Limits
 from pipeline.extract.units import in_true_units
+from pipeline.extract.unmeasured import check_wrapped, with_rounding, without_frozen
 from pipeline.extract.writing_order import without_set_back_unnumbered
 from pipeline.logs.health import utc
 from pipeline.logs.reader import MissionLog
@@ -123,6 +123,8 @@ def _in_place(
         (reader, in_true_units(reader.source, role, rows, suspicions)) for (reader, _), rows in zip(parts, timed, strict=True)
     ]
     filled = [(reader, without_frozen(without_fill_ins(rows, role, suspicions), role, suspicions)) for reader, rows in found]
+    for _, rows in filled:
+        check_wrapped(rows, role, suspicions)
     return [(reader, with_rounding(rows, role, reader.source.sigma_m is not None, suspicions)) for reader, rows in filled]
 
 

@@ -78,3 +78,15 @@ def test_rounded_degrees_are_as_exact_as_their_decimals(tmp_path: Path, decimals
 def test_fine_degrees_and_a_target_that_stands_are_not_rounded(tmp_path: Path, step_deg: float) -> None:
     rows = [fix(float(i), round(48.1 + step_deg * i, 4), round(11.6 + step_deg * i, 4)) for i in range(100)]
     assert not [each for each in run(tmp_path, rows).summary["suspicions"] if "decimal" in each["seen"]]
+
+
+@pytest.mark.parametrize("agent", ["a", None])
+@pytest.mark.parametrize("unit_m", [0.001, 0.01])
+def test_a_coordinate_that_runs_over_its_field_is_named(tmp_path: Path, unit_m: float, agent: str | None) -> None:
+    place_m = way() * unit_m / 0.01
+    counts = np.round((place_m + np.array([250.0 * unit_m / 0.01, 0.0])) / unit_m).astype(np.int64)
+    wrapped_m = ((counts + 2**15) % 2**16 - 2**15) * unit_m
+    told = [each for each in run(tmp_path, seen(wrapped_m, agent=agent)).summary["suspicions"] if "16 bits" in each["seen"]]
+    assert [each["seen"].split(",")[0] for each in told] == [f"x jumps 2 times by {2**16 * unit_m:g} m"]
+    wide = run(tmp_path, seen(counts * unit_m, agent=agent)).summary["suspicions"]
+    assert not [each for each in wide if "16 bits" in each["seen"]]

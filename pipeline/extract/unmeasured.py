@@ -1,4 +1,4 @@
-"""Positions that were not measured as they stand: repeated while the target went on, or rounded to a part of a degree."""
+"""Positions that were not measured as they stand: repeated while the target went on, run over, or rounded degrees."""
 
 from collections.abc import Iterator
 from typing import Final
@@ -21,6 +21,9 @@ _DECIMALS: Final = (1, 2, 3)
 _MIN_ROWS: Final = 10
 _MIN_PLACES: Final = 3
 _UNIFORM: Final = 12.0**0.5
+_STEPS_M: Final = (0.001, 0.01, 0.1, 1.0)
+"""Units in which sensors count metres in 16 bits."""
+_SMALL: Final = 0.1
 
 
 def without_frozen(rows: Positions, role: str, suspicions: Suspicions) -> Positions:
@@ -46,6 +49,32 @@ def without_frozen(rows: Positions, role: str, suspicions: Suspicions) -> Positi
         setting=f'where in its [[extract.{role}]] (a condition that tells them), or extract.trusted = ["place"]',
     )  # fmt: skip
     return rows[~is_frozen]
+
+
+def check_wrapped(rows: Positions, role: str, suspicions: Suspicions) -> None:
+    """Tell of metres that jump from one end of what 16 bits hold to the other: a number that ran over."""
+    if len(rows) < _MIN_ROWS or rows.is_geodetic.any() or not suspicions.looks_for("place"):
+        return
+    for axis, values in (("x", rows.first), ("y", rows.second)):
+        for step_m in _STEPS_M:
+            number = sum(_wraps(values[track], 2**16 * step_m) for track in _tracks(rows))
+            if number:
+                times = counted(number, "time")
+                suspicions.add(
+                    "place", str(rows.topic[0]),
+                    seen=f"{axis} jumps {times} by {2**16 * step_m:g} m, from one end of what 16 bits hold to the other",
+                    done="used as it stands",
+                    setting=f'{axis} in its [[extract.{role}]], of a field that is wide enough, or extract.trusted = ["place"]',
+                )  # fmt: skip
+
+
+def _wraps(values: Float64s, width_m: float) -> int:
+    """How often a coordinate [N] of a track runs over, if it is in fields of that width; it moves in small steps else."""
+    reach, step = np.abs(values), np.abs(np.diff(values))
+    if not len(step) or not 0.45 * width_m < reach.max() <= 0.5 * width_m or np.quantile(step, 0.75) > _SMALL * width_m:
+        return 0
+    is_over = np.abs(step - width_m) < _SMALL * width_m
+    return int((is_over & (np.minimum(reach[1:], reach[:-1]) > 0.4 * width_m)).sum())
 
 
 def with_rounding(rows: Positions, role: str, is_told: bool, suspicions: Suspicions) -> Positions:
