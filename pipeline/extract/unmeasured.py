@@ -135,9 +135,10 @@ def _frozen(place_m: Float64s, time_s: Float64s) -> Bools:
         is_usual[end : end + 1] = False
     if not runs or is_usual.sum() < 2 * _MIN_RUN or is_same[is_usual].mean() > _MAX_REPEATS:
         return found
+    usual_s = float(np.median(step_s[is_usual]))
     usual_m, usual_mps = float(np.quantile(step_m[is_usual], 0.9)), float(np.median(step_m[is_usual] / step_s[is_usual]))
     for begin, end in runs:  # rows begin to end are alike, and the step `end` leads away
-        if end < len(step_m):
+        if end < len(step_m) and step_s[end] <= _PACE * usual_s:  # after a silence it may as well have stood before
             pace = step_m[end] / max(time_s[end + 1] - time_s[begin], 1e-9)
             if step_m[end] > _LEAP * usual_m and usual_mps / _PACE < pace < usual_mps * _PACE:
                 found[begin + 1 : end + 1] = True

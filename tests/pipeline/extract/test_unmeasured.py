@@ -63,6 +63,13 @@ def test_what_repeats_itself_in_another_way_is_left_as_it_is(tmp_path: Path, pla
     assert not [told for told in found.summary["suspicions"] if "to the last digit" in told["seen"]]
 
 
+def test_a_target_that_stood_before_a_silence_is_believed(tmp_path: Path) -> None:
+    place_m = way()
+    place_m[30:41] = place_m[30]
+    rows = [each for number, each in enumerate(seen(place_m)) if not 41 <= number < 80]
+    assert run(tmp_path, rows).summary["suspicions"] == []
+
+
 @pytest.mark.parametrize(("decimals", "sigma_m"), [(2, 321.3), (3, 32.13)])
 def test_rounded_degrees_are_as_exact_as_their_decimals(tmp_path: Path, decimals: int, sigma_m: float) -> None:
     rows = [fix(float(i), round(48.1 + 2e-4 * i, decimals), round(11.6 + 3e-4 * i, decimals)) for i in range(300)]
