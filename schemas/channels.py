@@ -33,6 +33,7 @@ OCCUPANCY = Channel("/cadence/occupancy", "foxglove.Grid")
 DETECTIONS = Channel("/cadence/detections", "cadence.Detection")
 TRANSFORM = Channel("/cadence/tf", "foxglove.FrameTransform")
 MAP = Channel("/cadence/map", "foxglove.GeoJSON")
+EVENTS = Channel("/cadence/events", "foxglove.Event")
 
 
 def fix_channel(agent_id: str) -> Channel:

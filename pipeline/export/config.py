@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+from pipeline.ask.question import Question
 from pipeline.logs.recorder import Compression
 
 
@@ -19,6 +20,8 @@ class ExportConfig:
     map_period_s          seconds between two regions on the map (viewers draw all at once); by default a window's history
     combined              also write the source log and our channels into one file
     compression           of the chunks: zstd, lz4 or none
+    questions             asked of the mission: answers.json, events.csv and the report have the answers
+    meeting_m             agents that came nearer than this may have met; by default a two-hundredth of the mission's extent
     """
 
     tick_s: float | None = None
@@ -29,8 +32,12 @@ class ExportConfig:
     map_period_s: float | None = None
     combined: bool = False
     compression: Compression = "zstd"
+    questions: tuple[Question, ...] = ()
+    meeting_m: float | None = None
 
     def __post_init__(self) -> None:
+        if self.meeting_m is not None and not self.meeting_m > 0:
+            raise ValueError(f"meeting_m must be above zero, got {self.meeting_m}")
         for name in ("tick_s", "map_period_s"):
             value = getattr(self, name)
             if value is not None and not 0.001 <= value < 1e9:

@@ -2,10 +2,12 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 
+from pipeline.ask.events import Event
 from pipeline.export import numbers
 from pipeline.export.occupancy import Occupancy, future_occupancy
 from pipeline.export.playback import LiveAgent, Tick
@@ -147,6 +149,18 @@ def _add_association(association: Any, sources: Sequence[dict[str, Any]]) -> Non
             )
     for name, column in (("entropy_bits", "probability"), ("first_entropy_bits", "first_probability")):
         setattr(association, name, numbers.entropy_bits(np.array([row[column] for row in sources])))
+
+
+def encode_event(event: Event, offset_ns: int) -> bytes:
+    """foxglove.Event with all columns of events.csv as its metadata."""
+    message = foxglove_class("foxglove.Event")()
+    message.start_time.FromNanoseconds(event.start_ns + offset_ns)
+    message.end_time.FromNanoseconds(event.end_ns + offset_ns)
+    for name, value in asdict(event).items():
+        if value is not None and name not in ("start_ns", "end_ns"):
+            message.metadata.add(key=name, value=f"{value:.6g}" if isinstance(value, float) else str(value))
+    data: bytes = message.SerializeToString()
+    return data
 
 
 def encode_transform(frame: Frame, time_ns: int) -> bytes:

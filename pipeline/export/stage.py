@@ -23,7 +23,7 @@ def export(directory: Path, config: ExportConfig, progress: Progress, force: boo
     catalogue = read_catalogue(directory)
     if config.combined:
         _check_combinable(catalogue)
-    inputs = [*mission_inputs(directory), *([catalogue.path] if config.combined else [])]
+    inputs = [*mission_inputs(directory, config.questions), *([catalogue.path] if config.combined else [])]
 
     def body(work: Path) -> dict[str, Any]:
         from pipeline.export.writing import write_files  # only now: to find nothing to do must not cost what drawing does

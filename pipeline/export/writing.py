@@ -2,10 +2,12 @@
 
 import json
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+from pipeline.ask.events import Event
+from pipeline.ask.told import ANSWERS_NAME, EVENTS_NAME, Told, tell
 from pipeline.catalogue import Catalogue
 from pipeline.config import config_as_dict
 from pipeline.export import maps, messages
@@ -34,7 +36,11 @@ def write_files(directory: Path, work: Path, catalogue: Catalogue, config: Expor
     mission = read_exported(directory, catalogue, config)
     stem = catalogue.name
     side = work / f"{stem}.cadence.mcap"
-    counts = _write_side_file(side, directory, mission, config, progress)
+    told = tell(directory, config.questions, config.meeting_m)
+    counts = _write_side_file(side, directory, mission, told, config, progress)
+    (work / EVENTS_NAME).write_text(told.events_csv(), encoding="utf-8")
+    if config.questions:
+        (work / ANSWERS_NAME).write_text(told.answers_json(), encoding="utf-8")
     if config.combined:
         write_combined(catalogue.path, side, work / f"{stem}.combined.mcap", Packing(config.compression), progress)
     topics = sorted(counts)
@@ -58,16 +64,19 @@ def write_files(directory: Path, work: Path, catalogue: Catalogue, config: Expor
         "tick_s": mission.tick_s,
         "clock_offset_s": mission.clock_offset_ns * 1e-9,
         "size_bytes": side.stat().st_size,
+        "num_events": len(told.events),
         "num_messages": dict(sorted(counts.items())),
     }
 
 
-def _write_side_file(path: Path, directory: Path, mission: Exported, config: ExportConfig, progress: Progress) -> Counter[str]:
+def _write_side_file(
+    path: Path, directory: Path, mission: Exported, told: Told, config: ExportConfig, progress: Progress
+) -> Counter[str]:
     """Write every message in the order of time; the number of messages by topic."""
     counts: Counter[str] = Counter()
     packing = Packing(config.compression, level=_ZSTD_LEVEL)
     with LogWriter(path, packing) as writer, progress.bar(len(mission.ticks), "export", "tick") as bar:
-        for time_ns, channel, data in _in_order(mission, config):
+        for time_ns, channel, data in _in_order(mission, told.events, config):
             writer.write(channel, time_ns, data)
             counts[channel.topic] += 1
             bar.update(channel is channels.AGENTS)
@@ -78,12 +87,13 @@ def _write_side_file(path: Path, directory: Path, mission: Exported, config: Exp
 _Message = tuple[int, Channel, bytes]
 
 
-def _in_order(mission: Exported, config: ExportConfig) -> Iterator[_Message]:
+def _in_order(mission: Exported, events: Sequence[Event], config: ExportConfig) -> Iterator[_Message]:
     """Log time, channel and content of every message by time, encoded one moment at a time."""
     windows, ticks, rows, frame = mission.hypotheses.windows, mission.ticks, mission.detections, mission.hypotheses.frame
     moments = [(window.origin_ns, 0, index) for index, window in enumerate(windows)]
     moments += [(row["time_ns"], 1, index) for index, row in enumerate(rows)]
     moments += [(tick.time_ns, 2, index) for index, tick in enumerate(ticks)]
+    moments += [(event.start_ns, 3, index) for index, event in enumerate(events)]
     moments.sort()
     map_start_ns = maps.plan_map(ticks, config.map_period_s) if frame.is_georeferenced else {}
     fixes = maps.MovingFixes(frame, mission.style)
@@ -95,6 +105,8 @@ def _in_order(mission: Exported, config: ExportConfig) -> Iterator[_Message]:
             yield time_ns, channels.HYPOTHESES, messages.encode_hypotheses(windows[index], frame, time_ns)
         elif kind == 1:
             yield from _detection(mission, rows[index], time_ns)
+        elif kind == 3:
+            yield time_ns, channels.EVENTS, messages.encode_event(events[index], mission.clock_offset_ns)
         else:
             tick = ticks[index]
             if shows_new_scene(ticks, index):

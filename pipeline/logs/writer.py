@@ -5,6 +5,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, BinaryIO, Self
 
+import foxglove_schemas_protobuf.Event_pb2 as event
 import foxglove_schemas_protobuf.FrameTransform_pb2 as frame_transform
 import foxglove_schemas_protobuf.GeoJSON_pb2 as geojson
 import foxglove_schemas_protobuf.Grid_pb2 as grid
@@ -22,6 +23,7 @@ LIBRARY = "cadence"
 _FOXGLOVE = {
     f"foxglove.{name}": getattr(module, name)
     for name, module in {
+        "Event": event,
         "FrameTransform": frame_transform,
         "GeoJSON": geojson,
         "Grid": grid,

@@ -20,6 +20,8 @@ def mission_inputs(directory: Path) -> list[Path]:
         "truth.parquet",
         "poses.parquet",
         "scores.json",
+        "answers.json",
+        "events.csv",
         *(f"{stage}.manifest.json" for stage in STAGES),
     ]
     return [directory / name for name in names if (directory / name).is_file()]

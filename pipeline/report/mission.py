@@ -17,6 +17,8 @@ import pyarrow as pa
 from cadence.arrays import Float32s, Float64s, Int64s
 from cadence.constraints.obstacles import Obstacles
 from cadence.errors import InputError
+from pipeline.ask.events import Event
+from pipeline.ask.told import read_told
 from pipeline.catalogue import Catalogue, read_catalogue, stated_path
 from pipeline.documents import parse_json
 from pipeline.files import hash_file
@@ -119,6 +121,7 @@ class Mission:
     start_ns, end_ns          of what is drawn: detections, truth, window origins
     log_start_ns, log_end_ns  of the log, where it keeps the same clock
     origins                   who was found among detections of unknown origin; these are given to their likeliest agent
+    answers, events           what export answered to configured questions, and events
     stored, solid             hypotheses and obstacles as other stages see them
     """
 
@@ -143,6 +146,8 @@ class Mission:
     stored: MissionHypotheses
     solid: Obstacles | None = None
     origins: Origins | None = None
+    answers: tuple[JsonDict, ...] = ()
+    events: tuple[Event, ...] = ()
 
     def called(self, agent: int, rows: Iterable[WindowRow]) -> str:
         """The agent's name with how likely it is there: the largest probability among `rows`, which are its own."""
@@ -219,6 +224,7 @@ def load_mission(directory: Path) -> Mission:
     truth_points = _points(truth, "agent_id", agents) if truth is not None else None
     start_ns, end_ns = _time_range(catalogue, [points for points in (detection_points, truth_points) if points], rows)
     log_start_ns, log_end_ns = _log_range(catalogue, start_ns, end_ns)
+    answers, events = read_told(directory)
     return Mission(
         log=stated_path(catalogue.path, directory),
         catalogue=catalogue,
@@ -241,6 +247,8 @@ def load_mission(directory: Path) -> Mission:
         stored=hypotheses,
         solid=as_obstacles(entries) if (entries := _obstacle_entries(directory)) else None,
         origins=origins,
+        answers=tuple(answers),
+        events=tuple(events),
     )
 
 

@@ -9,6 +9,7 @@ from string import Template
 
 from pipeline.clock import Clock, duration
 from pipeline.report.analysis import Analysis, Moment, share_of_steps
+from pipeline.report.answers import answers_section
 from pipeline.report.health import health_section
 from pipeline.report.markup import inline_json, legend, pairs, section, text
 from pipeline.report.mission import Mission
@@ -76,6 +77,7 @@ def write_page(mission: Mission, analysis: Analysis, payload: Payload, moments: 
         verdict_section(mission, analysis, payload.num_parted),
         _figures(mission),
         suspicions_section(mission),
+        answers_section(mission, mission.answers, mission.events),
         _reading(mission),
         _explorer(mission, payload),
         moments_section(mission, analysis, moments),
