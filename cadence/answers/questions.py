@@ -85,8 +85,8 @@ class Meeting:
 
 def inside(stories: Stories, agent: int, area: Area, span_s: Span, dwell_s: float = 0.0) -> Inside:
     """Whether agent number `agent` was in `area` within `span_s`, and for `dwell_s` without a break."""
-    cut = between(stories, *span_s)
-    stays, weight = visits(cut.time_s, cut.position_m[:, agent], area), stories.weight
+    cut = between(stories, (agent,), *span_s)
+    stays, weight = visits(cut.time_s, cut.position_m[:, 0], area), stories.weight
     begin_s, end_s = cut.time_s[[0, -1]]
     ever, first, last = stays.is_any, stays.first_s, stays.last_s
     at_start, at_end = ever & (first <= begin_s), ever & (last >= end_s)
@@ -105,8 +105,8 @@ def inside(stories: Stories, agent: int, area: Area, span_s: Span, dwell_s: floa
 
 def arrive(stories: Stories, agent: int, area: Area, span_s: Span) -> Arrival:
     """Whether agent number `agent` came into `area` from outside within `span_s`, and when first."""
-    cut = between(stories, *span_s)
-    track_m, weight = cut.position_m[:, agent], stories.weight
+    cut = between(stories, (agent,), *span_s)
+    track_m, weight = cut.position_m[:, 0], stories.weight
     stays = visits(cut.time_s, track_m, area)
     was_there = stays.is_any & (stays.first_s <= cut.time_s[0])
     # where an agent appears inside (it is no part of the story before) it did not come over the border
@@ -119,8 +119,8 @@ def arrive(stories: Stories, agent: int, area: Area, span_s: Span) -> Arrival:
 
 def passed(stories: Stories, agent: int, line: Path, span_s: Span) -> Passage:
     """Whether agent number `agent` crossed `line` within `span_s`."""
-    cut, weight = between(stories, *span_s), stories.weight
-    story, at_s, along_m, goes_right = _crossings(cut.time_s, cut.position_m[:, agent], line)
+    cut, weight = between(stories, (agent,), *span_s), stories.weight
+    story, at_s, along_m, goes_right = _crossings(cut.time_s, cut.position_m[:, 0], line)
     count = np.bincount(story, minlength=len(weight)).astype(np.float64)
     is_first = np.ones(len(story), dtype=bool)
     is_first[1:] = story[1:] != story[:-1]
@@ -160,12 +160,12 @@ def _crossings(time_s: Float64s, track_m: Float64s, line: Path) -> tuple[Indices
 
 def meet(stories: Stories, one: int, other: int, within_m: float, for_s: float, span_s: Span) -> Meeting:
     """Whether agents number `one` and `other` were within `within_m` of each other for `for_s` without a break."""
-    cut = between(stories, *span_s)
+    cut = between(stories, (one, other), *span_s)
     track_m, weight = cut.position_m, stories.weight
     # between two steps both go straight, and so does one as seen from the other
-    apart_m = track_m[:, other] - track_m[:, one]
+    apart_m = track_m[:, 1] - track_m[:, 0]
     stays = visits(cut.time_s, apart_m, Disc((0.0, 0.0), within_m)).lasting(for_s)
-    place_m, spread_m = _place(0.5 * (track_m[:, one] + track_m[:, other]), cut.time_s, stays.first_s, weight)
+    place_m, spread_m = _place(0.5 * (track_m[:, 0] + track_m[:, 1]), cut.time_s, stays.first_s, weight)
     return Meeting(
         met=probability(weight, stays.is_any),
         met_s=law(weight, stays.first_s),

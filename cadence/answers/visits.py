@@ -66,14 +66,25 @@ class Visits:
         return len(self.story)
 
 
-def between(stories: Stories, from_s: float, to_s: float) -> Stories:
-    """The stories from one time to another, cut exactly there; ValueError where they hold nothing of that time."""
+def between(stories: Stories, agents: tuple[int, ...], from_s: float, to_s: float) -> Stories:
+    """The stories of some agents from one time to another, cut exactly there; ValueError where nothing is known of that time.
+
+    Only these agents' positions are copied: those of all agents of a long mission may fill the memory.
+    """
+    chosen = replace(
+        stories, position_m=stories.position_m[:, list(agents)], agent_ids=tuple(stories.agent_ids[a] for a in agents),
+        height_m=None,
+    )  # fmt: skip
     first, last = max(from_s, float(stories.time_s[0])), min(to_s, float(stories.time_s[-1]))
     if not first <= last:
         raise ValueError(f"nothing is known between {from_s:g} s and {to_s:g} s")
-    inner = stories.time_s[(stories.time_s > first) & (stories.time_s < last)]
+    if first == stories.time_s[0] and last == stories.time_s[-1]:
+        return chosen
+    left, right = int(np.searchsorted(stories.time_s, first, "right")) - 1, int(np.searchsorted(stories.time_s, last)) + 1
+    near = replace(chosen, time_s=chosen.time_s[left:right], position_m=chosen.position_m[:, :, left:right])
+    inner = near.time_s[(near.time_s > first) & (near.time_s < last)]
     time_s = np.unique(np.concatenate([[first], inner, [last]]))
-    return replace(stories, time_s=time_s, position_m=stories.at(time_s), height_m=None)
+    return replace(near, time_s=time_s, position_m=near.at(time_s))
 
 
 def visits(time_s: Float64s, track_m: Float64s, area: Area) -> Visits:

@@ -1,7 +1,7 @@
 """Questions to stories, answered in a sentence and in numbers; the same for the command line, Python, events and report."""
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -11,6 +11,7 @@ import numpy as np
 from cadence.answers import questions
 from cadence.answers.estimates import Law, Probability, probability
 from cadence.answers.whereabouts import Whereabouts, whereabouts
+from cadence.arrays import Float64s
 from cadence.errors import InputError
 from pipeline.ask.known import Known
 from pipeline.ask.parts import part_words
@@ -182,7 +183,7 @@ def _meet(known: Known, question: Question) -> Iterator[Answer]:
     else:
         chosen = range(len(names)) if question.agent is None else [known.agent(question.agent)]
         pairs = sorted({(min(a, b), max(a, b)) for a, b in itertools.product(chosen, range(len(names))) if a != b})
-        pairs = [pair for pair in pairs if may_be_near(known, *pair, question.within_m, span)]
+        pairs = near_pairs(known, pairs, question.within_m, span)
     found = [_meeting(known, question, one, other, span) for one, other in pairs]
     found = [each for each in found if question.other is not None or (each.probability and each.probability.value > 0)]
     if not found:
@@ -194,18 +195,24 @@ def _meet(known: Known, question: Question) -> Iterator[Answer]:
     yield from sorted(found, key=_rank)
 
 
-def may_be_near(known: Known, one: int, other: int, within_m: float, span_s: tuple[float, float]) -> bool:
-    """Whether the boxes of all stories of two agents come within a distance between any two steps: a quick look."""
+def near_pairs(
+    known: Known, pairs: Sequence[tuple[int, int]], within_m: float, span_s: tuple[float, float]
+) -> list[tuple[int, int]]:
+    """Those of the pairs whose boxes of all stories come within a distance between any two steps: a quick look at all."""
     time_s = known.stories.time_s
     used = slice(max(int(np.searchsorted(time_s, span_s[0], "right")) - 1, 0), int(np.searchsorted(time_s, span_s[1])) + 1)
-    boxes = []
-    for agent in (one, other):
+    boxes: dict[int, tuple[Float64s, Float64s]] = {}
+    for agent in {agent for pair in pairs for agent in pair}:
         track = known.stories.position_m[:, agent, used]
         low, high = np.fmin.reduce(track, axis=0), np.fmax.reduce(track, axis=0)
-        boxes.append((np.fmin(low[:-1], low[1:]), np.fmax(high[:-1], high[1:])) if len(low) > 1 else (low, high))
-    (low, high), (other_low, other_high) = boxes
-    apart = np.maximum(np.maximum(low - other_high, other_low - high), 0.0)
-    return bool((np.hypot(apart[:, 0], apart[:, 1]) <= within_m).any())  # NaN compares as false
+        boxes[agent] = (np.fmin(low[:-1], low[1:]), np.fmax(high[:-1], high[1:])) if len(low) > 1 else (low, high)
+    found = []
+    for one, other in pairs:
+        (low, high), (other_low, other_high) = boxes[one], boxes[other]
+        apart = np.maximum(np.maximum(low - other_high, other_low - high), 0.0)
+        if (np.hypot(apart[:, 0], apart[:, 1]) <= within_m).any():  # NaN compares as false
+            found.append((one, other))
+    return found
 
 
 def _meeting(known: Known, question: Question, one: int, other: int, span: tuple[float, float]) -> Answer:

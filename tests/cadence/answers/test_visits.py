@@ -97,12 +97,12 @@ def test_a_circle_is_a_polygon_of_many_corners(seed):
 
 def test_stories_are_cut_exactly():
     stories = Stories(np.array([0.0, 10.0, 20.0]), np.array([[[[0.0, 0.0], [10.0, 0.0], [10.0, 20.0]]]]), np.ones(1), ("a",))
-    cut = between(stories, 5.0, 12.0)
+    cut = between(stories, (0,), 5.0, 12.0)
     assert cut.time_s.tolist() == [5, 10, 12]
     assert cut.position_m[0, 0].tolist() == [[5, 0], [10, 0], [10, 4]]
-    assert between(stories, -5.0, 100.0).time_s.tolist() == [0, 10, 20]
+    assert between(stories, (0,), -5.0, 100.0).time_s.tolist() == [0, 10, 20]
     with pytest.raises(ValueError, match="nothing is known"):
-        between(stories, 21.0, 30.0)
+        between(stories, (0,), 21.0, 30.0)
 
 
 def test_areas_without_meaning_are_refused():
