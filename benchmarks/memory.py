@@ -21,7 +21,7 @@ DATA = Path(__file__).resolve().parents[1].parent / "shared" / "data"
 LIMIT_GB = 1.5
 _UNIT = 1024 if sys.platform.startswith("linux") else 1
 _COMMAND = "import sys, cli; sys.exit(cli.main())"
-_IMPORTS = "import pipeline.batch.run"
+_IMPORTS = "import importlib; from pipeline.batch.engines.local import PRELOADED; [*map(importlib.import_module, PRELOADED)]"
 
 
 @dataclass(frozen=True)

@@ -34,6 +34,7 @@ PAGES = {
     "several_targets": ("rendezvous", "attention_cost"),
     "association": ("association",),
     "not_stated": ("measurement_noise",),
+    "clutter": ("clutter",),
     "logs": ("log_reading", "plausibility", "log_writing"),
     "runs": ("batch", "batch_engines", "memory", "many_agents"),
     "rivals": (),

@@ -5,6 +5,7 @@ out among them by weight; under its association every joint track has detections
 """
 
 import itertools
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -16,7 +17,7 @@ import torch
 
 from cadence.arrays import Float64s, Int64s
 from cadence.association.associate import associate
-from cadence.association.fitting import fit_habits
+from cadence.association.fitting import fit_habits, num_steps_to_fit
 from cadence.association.particles import Stream
 from cadence.association.presence import Habits
 from cadence.association.single import is_one_target
@@ -27,6 +28,7 @@ from cadence.resampling import systematic
 from cadence.seeds import part_seeds
 from cadence.types import Evidence, WindowBatch
 from pipeline.grids import Grid, GridConfig, plan_grid
+from pipeline.progress import Progress
 from pipeline.tracks import DetectionTrack, track_of
 from pipeline.windows import MissionWindows, is_first_or_last, kept_tracks, middle_m, padded_detections, window_seeds
 from schemas.tables import ASSOCIATIONS, LABELS
@@ -138,6 +140,7 @@ def tell_sources(
     seed: int,
     default_sigma_m: float = 0.0,
     max_speed_mps: float | None = None,
+    progress: Progress | None = None,
 ) -> Sources:
     """Names for detections without one, and the grid, whose step follows from the gaps of single agents.
 
@@ -150,13 +153,16 @@ def tell_sources(
     nameless = _Nameless.of(detections, default_sigma_m)
     if config.num_agents is None and detections["agent_id"].null_count == detections.num_rows:
         config = replace(config, num_agents=1 if is_one_target(nameless.stream, max_speed_mps) else None)
-    habits = fit_habits(nameless.stream, config, seed, max_speed_mps)
-    if grid.step_s is None:
-        # A few particles tell how long gaps are.
-        rough = replace(config, num_particles=min(config.num_particles, _ROUGH_PARTICLES), num_associations=1)
-        first = nameless.told_apart(planned.origins_ns[-1:], rough, seed, habits)
-        planned = plan_grid(first.named(detections), grid)
-    association = nameless.told_apart(planned.origins_ns, config, seed, habits)
+    num = len(nameless.row)
+    num_steps = num_steps_to_fit(num, config) + num * (2 if grid.step_s is None else 1)
+    with (progress or Progress(quiet=True)).bar(num_steps, "tell apart", unit="detection") as bar:
+        habits = fit_habits(nameless.stream, config, seed, max_speed_mps, bar.update)
+        if grid.step_s is None:
+            # A few particles tell how long gaps are.
+            rough = replace(config, num_particles=min(config.num_particles, _ROUGH_PARTICLES), num_associations=1)
+            first = nameless.told_apart(planned.origins_ns[-1:], rough, seed, habits, bar.update)
+            planned = plan_grid(first.named(detections), grid)
+        association = nameless.told_apart(planned.origins_ns, config, seed, habits, bar.update)
     return Sources(association.named(detections), planned, association)
 
 
@@ -181,10 +187,19 @@ class _Nameless:
         position_m = self.track.position_m - self.track.position_m.mean(axis=0)
         return Stream(self._seconds(self.track.time_ns), position_m, self.track.covariance_m2)
 
-    def told_apart(self, origins_ns: Int64s, config: AssociationConfig, seed: int, habits: Habits) -> DataAssociation:
+    def told_apart(
+        self, origins_ns: Int64s, config: AssociationConfig, seed: int, habits: Habits, on_step: Callable[[], object]
+    ) -> DataAssociation:
         stream = self.stream
         found = associate(
-            stream.time_s, stream.position_m, stream.covariance_m2, self._seconds(origins_ns), config, seed, habits=habits
+            stream.time_s,
+            stream.position_m,
+            stream.covariance_m2,
+            self._seconds(origins_ns),
+            config,
+            seed,
+            habits=habits,
+            on_step=on_step,
         )
         if config.num_agents is None:
             found = without_unlikely(found)

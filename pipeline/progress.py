@@ -83,7 +83,8 @@ class RelayedProgress(Progress):
 
     def part(self, begin: float, end: float) -> "RelayedProgress":
         """As above."""
-        return RelayedProgress(self.quiet, self.tell, begin, end)
+        width = self.end - self.begin
+        return RelayedProgress(self.quiet, self.tell, self.begin + begin * width, self.begin + end * width)
 
 
 class _ToldBar(tqdm):  # type: ignore[type-arg]

@@ -8,7 +8,7 @@ chooses where to begin: a stream that is thought clean makes an agent of every f
 import dataclasses
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -37,39 +37,56 @@ _FIRST_DEPARTURES = 0.5
 """How many agents are thought to leave within a log before anything is known."""
 _RATE_WEIGHTS = (2.0, 5.0, 15.0, 50.0)
 _RATE_MEMORIES = (0.75, 0.9, 1.0)
-_NUM_PARTICLES, _MAX_DETECTIONS, _NUM_ROUNDS = 16, 400, 3
+_NUM_PARTICLES, _NUM_ROUNDS = 16, 3
+_NUM_FIRST, _MAX_DETECTIONS = 150, 400
+"""So many detections choose among beginnings, in which agents may move in any way, which is slow; so many are fitted to."""
 _LEAST_SHARE, _PSEUDO_COUNT = 0.02, 4.0
 
 
-def fit_habits(stream: Stream, config: AssociationConfig, seed: int, max_speed_mps: float | None = None) -> Habits:
-    """The habits of greatest likelihood for a stream; any sensible ones for a stream that says nothing."""
-    part = stream[:_MAX_DETECTIONS]
+def num_steps_to_fit(num_detections: int, config: AssociationConfig) -> int:
+    """How often `fit_habits` looks at a detection."""
+    num_shares = 1 if config.clutter_share is not None else len(_CLUTTER_SHARES)
+    num_first = num_shares * (1 if config.num_agents is not None else len(_NUM_AGENTS))
+    num_runs = num_shares + _NUM_ROUNDS - 2
+    return num_first * min(num_detections, _NUM_FIRST) + num_runs * min(num_detections, _MAX_DETECTIONS)
+
+
+def fit_habits(
+    stream: Stream,
+    config: AssociationConfig,
+    seed: int,
+    max_speed_mps: float | None = None,
+    on_step: Callable[[], object] = int,
+) -> Habits:
+    """The habits of greatest likelihood for a stream; any sensible ones for a stream that says nothing.
+
+    `on_step` hears of each of the steps that `num_steps_to_fit` counts.
+    """
+    first, part = stream[:_NUM_FIRST], stream[:_MAX_DETECTIONS]
     numbers = _NUM_AGENTS if config.num_agents is None else (config.num_agents,)
     shares = _CLUTTER_SHARES if config.clutter_share is None else (config.clutter_share,)
     tried = [[_first_habits(stream, config, number, share, max_speed_mps) for number in numbers] for share in shares]
     if len(stream.time_s) < 2:
         return tried[0][len(numbers) // 2]
     is_counted = config.clutter_share is None
-    rounds = [_round(part, _likeliest(part, habits, seed), is_counted, seed) for habits in tried]
+    rounds = []
+    for group in tried:
+        habits = _improved(*_likeliest(first, group, seed, on_step), first, is_counted)
+        rounds.append((habits, _run(part, habits, seed, on_step)))
     habits, run = max(rounds, key=lambda round_: round_[1][0].log_evidence)
-    for _ in range(_NUM_ROUNDS - 1):
-        habits, run = _round(part, (habits, run), is_counted, seed)
-    return habits
+    for _ in range(_NUM_ROUNDS - 2):
+        habits = _improved(habits, run, part, is_counted)
+        run = _run(part, habits, seed, on_step)
+    return _improved(habits, run, part, is_counted)
 
 
 _Run = tuple[Particles, Float64s]
 """The particles after a whole stream, and how much each mode was used [C]."""
 
 
-def _likeliest(stream: Stream, tried: Sequence[Habits], seed: int) -> tuple[Habits, _Run]:
-    return max(((habits, _run(stream, habits, seed)) for habits in tried), key=lambda found: found[1][0].log_evidence)
-
-
-def _round(stream: Stream, before: tuple[Habits, _Run], is_counted: bool, seed: int) -> tuple[Habits, _Run]:
-    """Better habits, and what comes of them; `is_counted`: of clutter, too."""
-    habits, run = before
-    improved = _improved(habits, *run, stream, is_counted)
-    return improved, _run(stream, improved, seed)
+def _likeliest(stream: Stream, tried: Sequence[Habits], seed: int, on_step: Callable[[], object]) -> tuple[Habits, _Run]:
+    runs = ((habits, _run(stream, habits, seed, on_step)) for habits in tried)
+    return max(runs, key=lambda found: found[1][0].log_evidence)
 
 
 def _first_habits(
@@ -102,20 +119,23 @@ def _first_habits(
     )
 
 
-def _run(stream: Stream, habits: Habits, seed: int) -> _Run:
+def _run(stream: Stream, habits: Habits, seed: int, on_step: Callable[[], object]) -> _Run:
     usage = np.zeros(len(habits.modes))
     switch, share = habits.modes.switch_share, habits.modes.share
     for number, particles in enumerate(follow(stream, habits, _NUM_PARTICLES, seed), -1):
         is_seen_again = (particles.recent[..., -1] == number) & (particles.recent[..., -2] >= 0)
         row, agent = np.nonzero(is_seen_again)
-        after = np.exp(particles.tracks.log_share[row, agent])
+        after = np.exp(particles.tracks.log_share[particles.tracks.row[row, agent]])
         before_switch = (after - switch * share) / (1.0 - switch)
         usage += (particles.weight[row, None] * before_switch).sum(0)
+        if number >= 0:
+            on_step()
     return particles, usage
 
 
-def _improved(habits: Habits, particles: Particles, usage: Float64s, stream: Stream, is_clutter_counted: bool) -> Habits:
+def _improved(habits: Habits, run: _Run, stream: Stream, is_clutter_counted: bool) -> Habits:
     """Habits after one round: modes as often as they were used, rates as one history of the likeliest particle counts them."""
+    particles, usage = run
     share = usage + _PSEUDO_COUNT / len(usage)
     share = share / share.sum()
     is_used = share >= _LEAST_SHARE
@@ -143,7 +163,7 @@ def _with_rates(habits: Habits, tracks: Tracks, rate_hz: float, watched_s: float
     """How often agents are detected, come and leave, as one association hypothesis counts it."""
     num = int(tracks.num_agents[0])
     left = left_by(tracks, habits, span_s)[0, :num]
-    watched_s += float(((1.0 - left) * (span_s - tracks.last_s[0, :num])).sum())
+    watched_s += float(((1.0 - left) * (span_s - tracks.last_s[tracks.row[0, :num]])).sum())
     leave_hz = (float(left.sum()) + _FIRST_DEPARTURES) / watched_s
     return dataclasses.replace(habits, rate_hz=rate_hz, leave_hz=leave_hz, num_present=num / (1.0 + leave_hz * span_s))
 

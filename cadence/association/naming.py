@@ -32,8 +32,9 @@ def named_like(label: Int64s, reference: Int64s) -> Int64s:
     is_match = overlap[rows, columns] > 0
     name[rows[is_match]] = columns[is_match]
     nameless = np.flatnonzero(name[:-1] == CLUTTER)
-    free = np.setdiff1d(np.arange(num_own + num_other), name)
-    name[nameless] = free[: len(nameless)]
+    is_free = np.ones(num_own + num_other, dtype=np.bool_)
+    is_free[name[name != CLUTTER]] = False
+    name[nameless] = np.flatnonzero(is_free)[: len(nameless)]
     return np.asarray(name[label], dtype=np.int64)
 
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from cadence.arrays import Bools, Float64s, Int64s
-from cadence.association.history import Step, drawn_associations, grouped, recently, step_of
+from cadence.association.history import Ending, Step, drawn_associations, grouped, recently, step_of
 from cadence.association.presence import Habits, log_hazards, log_silence_between
 from cadence.association.tracks import Detection, Tracks, log_densities, updated
 from cadence.association.types import CLUTTER
@@ -70,7 +70,7 @@ class Particles:
 
     def associations(self, particle: Int64s, generator: np.random.Generator) -> Int64s:
         """Labels [M, N] of one hypothesis for each of M particles, drawn from its pasts."""
-        return drawn_associations(self.steps, particle, generator)
+        return drawn_associations(self.steps, [Ending(len(self.steps), particle, generator)])[0]
 
 
 def follow(stream: Stream, habits: Habits, num_particles: int, seed: int, num_recent: int = NUM_RECENT) -> Iterator[Particles]:
@@ -122,22 +122,22 @@ def _next(
 
 def _with_room(recent: Int64s, num_slots: int) -> Int64s:
     """The same with room for so many agents at least."""
-    more = max(num_slots - recent.shape[1], 0)
-    return np.pad(recent, [(0, 0), (0, more), (0, 0)], constant_values=-1)
+    more = num_slots - recent.shape[1]
+    return recent if more <= 0 else np.pad(recent, [(0, 0), (0, more), (0, 0)], constant_values=-1)
 
 
 def continuations(tracks: Tracks, habits: Habits, seen: Detection, before_s: float) -> Float64s:
     """Log density [P, A + 2] of the silence up to the detection and of the detection from each agent, a new one, or nobody."""
     out = log_hazards(tracks, habits, seen.time_s) + log_silence_between(tracks, habits, before_s, seen.time_s)[:, None]
-    out[:, :-2] += habits.temper * log_densities(tracks, habits.modes, seen)
+    out[:, :-2] += (habits.temper * log_densities(tracks, habits.modes, seen))[tracks.row]
     out[:, -2:] -= habits.temper * np.log(habits.area_m2)
     if habits.max_speed_mps is not None:
-        out[:, :-2][is_too_fast(tracks, habits, seen)] = -np.inf
+        out[:, :-2][is_too_fast(tracks, habits, seen)[tracks.row]] = -np.inf
     return out
 
 
 def is_too_fast(tracks: Tracks, habits: Habits, seen: Detection) -> Bools:
-    """Agents [P, A] that would have to exceed the speed limit by more than four standard deviations to be seen here."""
+    """Tracks [R] that would have to exceed the speed limit by more than four standard deviations to be seen here."""
     place = (np.exp(tracks.log_share)[..., None] * tracks.mean[..., :2]).sum(-2)
     variance = tracks.covariance[..., 0, 0].max(-1) + tracks.covariance[..., 1, 1].max(-1) + np.trace(seen.covariance_m2)
     way_m = np.sqrt(((seen.position_m - place) ** 2).sum(-1))

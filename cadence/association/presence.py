@@ -51,7 +51,7 @@ class Habits:
 
 
 def log_silence(tracks: Tracks, habits: Habits, time_s: float) -> tuple[Float64s, Float64s]:
-    """For every agent [P, A]: log probability of no detection from its last one to `time_s`, and log density of one just then.
+    """For every track [R]: log probability of no detection from its last one to `time_s`, and log density of one just then.
 
     An agent that stays is silent with probability (1 + silent / watched) ^ -count (a Poisson process whose rate has a gamma
     law); one that leaves is silent from then on. The two are joined as for a Poisson process of the same silence.
@@ -66,11 +66,11 @@ def log_silence(tracks: Tracks, habits: Habits, time_s: float) -> tuple[Float64s
 def left_by(tracks: Tracks, habits: Habits, time_s: float) -> Float64s:
     """Probability that an agent has left, given its silence from its last detection to `time_s` [P, A]."""
     _, _, unseen, left = _waiting(tracks, habits, time_s)
-    return np.asarray(1.0 - np.exp(-unseen - left - log_silence(tracks, habits, time_s)[0]))
+    return np.asarray(1.0 - np.exp(-unseen - left - log_silence(tracks, habits, time_s)[0]))[tracks.row]
 
 
 def _waiting(tracks: Tracks, habits: Habits, time_s: float) -> tuple[Float64s, Float64s, Float64s, Float64s]:
-    """Evidence of each agent's rate at `time_s` (detections, seconds), and minus the log probabilities of silence and stay."""
+    """Evidence of each track's rate at `time_s` (detections, seconds), and minus the log probabilities of silence and stay."""
     silent_s = np.maximum(time_s - tracks.last_s, 0.0)
     watched_s = habits.rate_weight / habits.rate_hz + tracks.watched_s
     count = habits.rate_weight + tracks.repeats
@@ -79,9 +79,9 @@ def _waiting(tracks: Tracks, habits: Habits, time_s: float) -> tuple[Float64s, F
 
 def log_silence_between(tracks: Tracks, habits: Habits, begin_s: float, end_s: float) -> Float64s:
     """Log probability that nobody was detected from `begin_s` to `end_s`, given the detections up to `begin_s` [P]."""
-    is_met = np.arange(tracks.last_s.shape[1]) < tracks.num_agents[:, None]
     silence = log_silence(tracks, habits, end_s)[0] - log_silence(tracks, habits, begin_s)[0]
-    return np.asarray(np.where(is_met, silence, 0.0).sum(1) - _num_new(tracks, habits, begin_s, end_s))
+    silence[0] = 0.0
+    return np.asarray(silence[tracks.row].sum(1) - _num_new(tracks, habits, begin_s, end_s))
 
 
 def log_hazards(tracks: Tracks, habits: Habits, time_s: float) -> Float64s:
@@ -89,11 +89,12 @@ def log_hazards(tracks: Tracks, habits: Habits, time_s: float) -> Float64s:
 
     An agent that was detected at this very moment is not detected twice.
     """
-    num_particles, num_slots = tracks.last_s.shape
+    num_particles, num_slots = tracks.row.shape
     silence, again = log_silence(tracks, habits, time_s)
-    is_possible = (np.arange(num_slots) < tracks.num_agents[:, None]) & (tracks.last_s < time_s)
+    hazard = np.where(tracks.last_s < time_s, again - silence, -np.inf)
+    hazard[0] = -np.inf
     hazards = np.empty((num_particles, num_slots + 2))
-    hazards[:, :-2] = np.where(is_possible, again - silence, -np.inf)
+    hazards[:, :-2] = hazard[tracks.row]
     with np.errstate(divide="ignore"):
         hazards[:, -2] = np.log(_new_hz(tracks, habits, time_s))
         hazards[:, -1] = np.log(habits.clutter_hz)

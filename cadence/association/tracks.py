@@ -1,8 +1,11 @@
-"""What each association hypothesis knows of its agents: a Kalman filter an agent and mode, as of the agent's last detection."""
+"""What each association hypothesis knows of its agents: a Kalman filter an agent and mode, as of the agent's last detection.
 
-import dataclasses
+Hypotheses differ in a few agents and agree on most. So a track, which is what the detections of one agent make of it, is kept
+once, whoever believes in it, and is carried on once for all who give it the next detection.
+"""
+
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -12,52 +15,44 @@ from cadence.association.motion import Modes, motion
 
 @dataclass(frozen=True, eq=False)
 class Tracks:
-    """P particles with room for A agents in C modes; what lies behind `num_agents` is empty.
+    """The agents of P particles with room for A each, as rows of R tracks in C modes, of which the first is nobody's.
 
-    mean        [P, A, C, 4] x, y, vx, vy after the agent's last detection
-    covariance  [P, A, C, 4, 4]
-    log_share   [P, A, C] log probability of the modes
-    last_s      [P, A] time of the last detection
-    repeats     [P, A] detections after the first, of which old ones count less
-    watched_s   [P, A] time in which they came, counted alike
+    row         [P, A] track of each agent; 0 behind `num_agents`
     num_agents  [P] agents met so far
+    mean        [R, C, 4] x, y, vx, vy after the last detection
+    covariance  [R, C, 4, 4]
+    log_share   [R, C] log probability of the modes
+    last_s      [R] time of the last detection
+    repeats     [R] detections after the first, of which old ones count less
+    watched_s   [R] time in which they came, counted alike
     """
 
+    row: Int64s
+    num_agents: Int64s
     mean: Float64s
     covariance: Float64s
     log_share: Float64s
     last_s: Float64s
     repeats: Float64s
     watched_s: Float64s
-    num_agents: Int64s
 
     @classmethod
     def none(cls, num_modes: int) -> "Tracks":
         """One particle that has met nobody."""
         return cls(
-            np.zeros((1, 0, num_modes, 4)),
-            np.zeros((1, 0, num_modes, 4, 4)),
-            np.zeros((1, 0, num_modes)),
-            np.zeros((1, 0)),
-            np.zeros((1, 0)),
-            np.zeros((1, 0)),
+            np.zeros((1, 0), dtype=np.int64),
             np.zeros(1, dtype=np.int64),
+            np.zeros((1, num_modes, 4)),
+            np.zeros((1, num_modes, 4, 4)),
+            np.zeros((1, num_modes)),
+            np.zeros(1),
+            np.zeros(1),
+            np.zeros(1),
         )
 
     def __getitem__(self, particles: Int64s) -> "Tracks":
         """A selection of particles; repeats are allowed."""
-        return Tracks(**{field.name: getattr(self, field.name)[particles] for field in dataclasses.fields(self)})
-
-    def with_room(self, num_slots: int) -> "Tracks":
-        """The same with room for so many agents at least."""
-        more = num_slots - self.last_s.shape[1]
-        if more <= 0:
-            return self
-        columns = {}
-        for field in dataclasses.fields(self):
-            value = getattr(self, field.name)
-            columns[field.name] = value if value.ndim == 1 else np.pad(value, [(0, 0), (0, more), *[(0, 0)] * (value.ndim - 2)])
-        return Tracks(**columns)
+        return replace(self, row=self.row[particles], num_agents=self.num_agents[particles])
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +65,7 @@ class Detection:
 
 
 def log_densities(tracks: Tracks, modes: Modes, seen: Detection) -> Float64s:
-    """Log density of the detection under every agent [P, A], per square metre; only agents that were met have a meaning."""
+    """Log density of the detection under every track [R], per square metre; that of nobody has no meaning."""
     way = motion(modes, seen.time_s - tracks.last_s)
     gain = way.gain[..., None]
     offset = seen.position_m - tracks.mean[..., :2] - gain * tracks.mean[..., 2:]
@@ -97,21 +92,36 @@ def updated(tracks: Tracks, modes: Modes, seen: Detection, agent: Int64s, memory
 
     With each detection of an agent the earlier ones count `memory` times as much for how often it is detected.
     """
-    tracks = tracks.with_room(int(agent.max(initial=-1)) + 1)
-    out = tracks[np.arange(len(agent))]  # a copy
+    num_before = len(tracks.last_s)
+    num_more = int(agent.max(initial=-1)) + 1 - tracks.row.shape[1]
+    row = tracks.row.copy() if num_more <= 0 else np.pad(tracks.row, [(0, 0), (0, num_more)])
     is_new = agent == tracks.num_agents
     again, first = np.flatnonzero((agent >= 0) & ~is_new), np.flatnonzero(is_new)
-    for rows, state in (
-        (again, _kalman(tracks, modes, seen, again, agent[again])),
-        (first, _first(modes, seen)),
-    ):
-        out.mean[rows, agent[rows]], out.covariance[rows, agent[rows]], out.log_share[rows, agent[rows]] = state
-        out.last_s[rows, agent[rows]] = seen.time_s
-    column = agent[again]
-    out.repeats[again, column] = 1.0 + memory * tracks.repeats[again, column]
-    out.watched_s[again, column] = seen.time_s - tracks.last_s[again, column] + memory * tracks.watched_s[again, column]
-    out.num_agents[first] += 1
-    return out
+    before, which = np.unique(row[again, agent[again]], return_inverse=True)
+    row[again, agent[again]] = num_before + which
+    row[first, agent[first]] = num_before + len(before)
+    is_used = np.zeros(num_before, dtype=np.bool_)
+    is_used[row[row < num_before]] = is_used[0] = True
+    kept = np.flatnonzero(is_used)
+    number = np.concatenate([np.cumsum(is_used) - 1, len(kept) + np.arange(len(before) + 1)])
+    num_first = min(len(first), 1)
+    states = [_kalman(tracks, modes, seen, before), tuple(value[None][:num_first] for value in _first(modes, seen))]
+    repeats = 1.0 + memory * tracks.repeats[before]
+    watched_s = seen.time_s - tracks.last_s[before] + memory * tracks.watched_s[before]
+    mean, covariance, log_share = (
+        np.concatenate([old[kept], *new])
+        for old, new in zip((tracks.mean, tracks.covariance, tracks.log_share), zip(*states, strict=True), strict=True)
+    )
+    return Tracks(
+        number[row],
+        tracks.num_agents + is_new,
+        mean,
+        covariance,
+        log_share,
+        np.concatenate([tracks.last_s[kept], np.full(len(before) + num_first, seen.time_s)]),
+        np.concatenate([tracks.repeats[kept], repeats, np.zeros(num_first)]),
+        np.concatenate([tracks.watched_s[kept], watched_s, np.zeros(num_first)]),
+    )
 
 
 def _first(modes: Modes, seen: Detection) -> tuple[Float64s, Float64s, Float64s]:
@@ -124,12 +134,10 @@ def _first(modes: Modes, seen: Detection) -> tuple[Float64s, Float64s, Float64s]
     return mean, covariance, np.log(modes.share)
 
 
-def _kalman(
-    tracks: Tracks, modes: Modes, seen: Detection, rows: Int64s, columns: Int64s
-) -> tuple[Float64s, Float64s, Float64s]:
-    """Predicted and updated state of one known agent in each of R particles, modes mixed afterwards."""
-    way = motion(modes, seen.time_s - tracks.last_s[rows, columns])
-    before, spread = tracks.mean[rows, columns], tracks.covariance[rows, columns]
+def _kalman(tracks: Tracks, modes: Modes, seen: Detection, rows: Int64s) -> tuple[Float64s, Float64s, Float64s]:
+    """Predicted and updated state of some of the tracks, modes mixed afterwards."""
+    way = motion(modes, seen.time_s - tracks.last_s[rows])
+    before, spread = tracks.mean[rows], tracks.covariance[rows]
     gain, decay = way.gain[..., None], way.decay[..., None]
     mean = np.concatenate([before[..., :2] + gain * before[..., 2:], decay * before[..., 2:]], -1)
     pp, pv, vv = spread[..., :2, :2], spread[..., :2, 2:], spread[..., 2:, 2:]
@@ -144,13 +152,16 @@ def _kalman(
     innovation = cross[..., :2, :] + seen.covariance_m2
     a, b, d = innovation[..., 0, 0], innovation[..., 0, 1], innovation[..., 1, 1]
     determinant = a * d - b * b
-    inverse = np.stack([np.stack([d, -b], -1), np.stack([-b, a], -1)], -2) / determinant[..., None, None]
     offset = seen.position_m - mean[..., :2]
-    weighed = (inverse @ offset[..., None])[..., 0]
-    log_share = tracks.log_share[rows, columns] - 0.5 * ((offset * weighed).sum(-1) + np.log(determinant))
+    x, y = offset[..., 0], offset[..., 1]
+    distance = (d * x * x - 2.0 * b * x * y + a * y * y) / determinant
+    log_share = tracks.log_share[rows] - 0.5 * (distance + np.log(determinant))
     share = np.exp(log_share - log_share.max(-1, keepdims=True))
-    mean = mean + (cross @ weighed[..., None])[..., 0]
-    covariance = covariance - cross @ inverse @ cross.swapaxes(-1, -2)
+    # the gain's two columns; written out, as products of small matrices take longer to begin than to compute
+    by_x = (cross[..., 0] * d[..., None] - cross[..., 1] * b[..., None]) / determinant[..., None]
+    by_y = (cross[..., 1] * a[..., None] - cross[..., 0] * b[..., None]) / determinant[..., None]
+    mean = mean + by_x * x[..., None] + by_y * y[..., None]
+    covariance = covariance - by_x[..., None] * cross[..., None, :, 0] - by_y[..., None] * cross[..., None, :, 1]
     return _mixed(mean, 0.5 * (covariance + covariance.swapaxes(-1, -2)), share / share.sum(-1, keepdims=True), modes)
 
 

@@ -97,6 +97,9 @@ class Bank:
 
     def posterior(self, windows: WindowBatch, num_hypotheses: int) -> BankPosterior:
         """Moments and joint samples for the active agents of `windows`, rows in the order of `is_active.nonzero()`."""
+        return self._posterior(windows, num_hypotheses, True)
+
+    def _posterior(self, windows: WindowBatch, num_hypotheses: int, with_moments: bool) -> BankPosterior:
         rows, seeds = active_rows(windows)
         floor_m = FLOOR_STEPS * self._speed() * windows.step_s
         rows = with_floor(rows, self.noise_steps * self.length_m(windows.step_s))
@@ -108,7 +111,9 @@ class Bank:
         chunk = max(1, _MAX_PAIRS // MAX_MODELS)
         for begin in range(0, len(rows.time_s), chunk):
             part = torch.arange(begin, min(begin + chunk, len(rows.time_s)))
-            parts.append(self._posterior_rows(nodes[part], log_posterior[part], seeds[part], windows, num_hypotheses))
+            parts.append(
+                self._posterior_rows(nodes[part], log_posterior[part], seeds[part], windows, num_hypotheses, with_moments)
+            )
         if not parts:
             empty = torch.zeros(0, windows.num_steps, 2, dtype=torch.float64)
             return BankPosterior(
@@ -119,7 +124,7 @@ class Bank:
 
     def sample(self, windows: WindowBatch, num_hypotheses: int) -> HypothesisSet:
         """Joint samples of the bank itself: the rival and release gate of the diffusion model."""
-        return scatter_hypotheses(self.posterior(windows, num_hypotheses).sample_m, windows)
+        return scatter_hypotheses(self._posterior(windows, num_hypotheses, False).sample_m, windows)
 
     def about(self) -> dict[str, float | int | None]:
         """What a summary says of it."""
@@ -155,20 +160,26 @@ class Bank:
         return takes_part.nonzero()[:, 0], index[chosen.model], weight[takes_part]
 
     def _posterior_rows(
-        self, rows: Nodes, log_posterior: Tensor, seeds: Tensor, windows: WindowBatch, num_hypotheses: int
+        self, rows: Nodes, log_posterior: Tensor, seeds: Tensor, windows: WindowBatch, num_hypotheses: int, with_moments: bool
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Mean [R, T, 2], sigma [R, T] and samples [R, K, T, 2] of some rows whose detections have their floor already."""
+        """Mean [R, T, 2], sigma [R, T] and samples [R, K, T, 2] of some rows whose detections have their floor already.
+
+        Without moments those are zero, which takes half of the time.
+        """
         models = self.models.scaled(windows.step_s, self._speed())
         diffuse_m = DIFFUSE_STEPS * self.length_m(windows.step_s)
-        smoothed = _smooth_rows(models, rows, choose_models(log_posterior), seeds, windows.time_s, num_hypotheses, diffuse_m)
+        chosen = choose_models(log_posterior)
+        smoothed = _smooth_rows(models, rows, chosen, seeds, windows.time_s, num_hypotheses, diffuse_m, with_moments)
         if self.switch_rate > 0.0:
             last_s = torch.where(rows.is_observed, rows.time_s, rows.time_s[:, :1]).amax(1)
             durations = durations_after(windows.time_s.double(), last_s)
             if bool((durations > 0).any()):
-                self._switch_after(smoothed, models, durations, windows.step_s)
+                self._switch_after(smoothed, models, durations, windows.step_s, with_moments)
         return smoothed.mean_m, smoothed.variance_m2.sqrt(), smoothed.sample_m
 
-    def _switch_after(self, smoothed: "_Smoothed", models: MotionModels, durations: Tensor, step_s: float) -> None:
+    def _switch_after(
+        self, smoothed: "_Smoothed", models: MotionModels, durations: Tensor, step_s: float, with_moments: bool
+    ) -> None:
         """Replace what `smoothed` says of the time after the last detection (durations [R, T]) by models that change."""
         # only models that carry weight take part after the last detection
         taking_part, chosen_index, later = self._models_after(smoothed.chosen)
@@ -177,8 +188,6 @@ class Bank:
         durations = durations[:, begin:]
         is_after = durations > 0
         node = smoothed.last_node
-        mean, covariance, weight = at_node(smoothed.filtered, smoothed.chosen, chosen_index, node, len(taking_part))
-        later_mean, later_variance = continue_moments(switching, durations, weight, mean, covariance)
         num_hypotheses, numbers = smoothed.sample_m.shape[1], smoothed.numbers
         state = smoothed.state[torch.arange(len(node))[:, None], torch.arange(num_hypotheses), node[:, None]]
         later_sample = continue_samples(
@@ -189,11 +198,15 @@ class Bank:
             numbers.uniform[:, :, begin:],
             numbers.kick[:, :, begin:],
         )
-        for whole, part, where in (
-            (smoothed.mean_m[:, begin:], later_mean, is_after[..., None]),
-            (smoothed.variance_m2[:, begin:], later_variance, is_after),
-            (smoothed.sample_m[:, :, begin:], later_sample, is_after[:, None, :, None]),
-        ):
+        replaced = [(smoothed.sample_m[:, :, begin:], later_sample, is_after[:, None, :, None])]
+        if with_moments:
+            mean, covariance, weight = at_node(smoothed.filtered, smoothed.chosen, chosen_index, node, len(taking_part))
+            later_mean, later_variance = continue_moments(switching, durations, weight, mean, covariance)
+            replaced += [
+                (smoothed.mean_m[:, begin:], later_mean, is_after[..., None]),
+                (smoothed.variance_m2[:, begin:], later_variance, is_after),
+            ]
+        for whole, part, where in replaced:
             whole.copy_(torch.where(where, part, whole))
 
 
@@ -224,17 +237,21 @@ def _smooth_rows(
     time_s: Tensor,
     num_hypotheses: int,
     diffuse_m: float,
+    with_moments: bool,
 ) -> _Smoothed:
     """Filter, smooth and sample every pair of row and chosen model, and mix the models of each row."""
     nodes, step_index = merge_grid(rows, time_s)
     diffuse = torch.full((len(chosen.row),), diffuse_m, dtype=torch.float64)
     filtered = filter_forward(models[chosen.model], nodes[chosen.row], diffuse)
     backward = backward_kernel(filtered)
-    node_mean, node_covariance = smooth(filtered, backward)
-    pick = step_index[chosen.row]
-    mean = node_mean[..., :2].gather(1, pick[..., None].expand(-1, -1, 2))
-    variance = (0.5 * (node_covariance[..., 0, 0] + node_covariance[..., 1, 1])).gather(1, pick)
-    mean, variance = mixture_moments(mean, variance, chosen)
+    mean = torch.zeros(len(rows.time_s), len(time_s), 2, dtype=torch.float64)
+    variance = torch.zeros_like(mean[..., 0])
+    if with_moments:
+        node_mean, node_covariance = smooth(filtered, backward)
+        pick = step_index[chosen.row]
+        each_mean = node_mean[..., :2].gather(1, pick[..., None].expand(-1, -1, 2))
+        each_variance = (0.5 * (node_covariance[..., 0, 0] + node_covariance[..., 1, 1])).gather(1, pick)
+        mean, variance = mixture_moments(each_mean, each_variance, chosen)
     num_nodes = nodes.time_s.shape[1]
     numbers = random_numbers(chosen.weight, rows, seeds, num_hypotheses, num_nodes, len(time_s), filtered.mean.shape[-1])
     pair = chosen.first_pair[:, None] + numbers.owner

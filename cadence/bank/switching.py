@@ -49,7 +49,8 @@ def continue_moments(
     """
     first = weight[..., None] * mean
     second = weight[..., None, None] * (covariance + mean[..., :, None] * mean[..., None, :])
-    entry, entry_noise = _entry(switching.models)
+    begin, entry_noise = _entry(switching.models)
+    has_home = switching.models.has_home
     means, variances = [], []
     steps = _Steps(switching.models, durations_s)
     for s in range(durations_s.shape[1]):
@@ -57,8 +58,10 @@ def continue_moments(
         stay = torch.exp(-switching.rate * duration)[:, None]
         share = (1.0 - stay) * switching.weight
         total = weight.sum(1, keepdim=True)
-        entering = (entry @ first.sum(1)[:, None, :, None])[..., 0]
-        entering_second = entry @ second.sum(1, keepdim=True) @ entry.mT + total[..., None, None] * entry_noise
+        whole_first, whole_second = first.sum(1, keepdim=True), second.sum(1, keepdim=True)
+        entering = torch.where(has_home[:, None], (begin @ whole_first[..., None])[..., 0], whole_first)
+        entering_second = torch.where(has_home[:, None, None], begin @ whole_second @ begin.mT, whole_second)
+        entering_second = entering_second + total[..., None, None] * entry_noise
         weight = stay * weight + share * total
         first = stay[..., None] * first + share[..., None] * entering
         second = stay[..., None, None] * second + share[..., None, None] * entering_second
@@ -73,18 +76,18 @@ def continue_moments(
 
 
 def _entry(models: MotionModels) -> tuple[Tensor, Tensor]:
-    """What becomes of the state when a model takes over [C, S, S], and the noise of that [C, S, S].
+    """What becomes of the state when a model with a home takes over [S, S], and the noise of that for every model [C, S, S].
 
     A target that begins to stay about a place does so where it is: the centre lies about it as the stationary law says.
     """
     size = models.num_states
-    matrix = torch.eye(size, dtype=torch.float64).repeat(len(models), 1, 1)
-    noise = torch.zeros_like(matrix)
+    matrix = torch.eye(size, dtype=torch.float64)
+    noise = torch.zeros(len(models), size, size, dtype=torch.float64)
     if size > 4:
         home = models.has_home
         for axis in (0, 1):
-            matrix[home, axis + 4, axis + 4] = 0.0
-            matrix[home, axis + 4, axis] = 1.0
+            matrix[axis + 4, axis + 4] = 0.0
+            matrix[axis + 4, axis] = 1.0
             noise[home, axis + 4, axis + 4] = models.home_range[home] ** 2
     return matrix, noise
 
@@ -109,22 +112,19 @@ def continue_samples(
     choice = torch.searchsorted(cumulative, uniform[..., 1].contiguous()).clamp(max=len(cumulative) - 1)
     rows = torch.arange(len(durations_s))[:, None]
     steps = _Steps(switching.models, durations_s)
-    entry, entry_noise = _entry(switching.models)
-    entry_root = entry_noise.sqrt()
+    roots = steps.roots()
     positions = []
     for s in range(durations_s.shape[1]):
         duration = durations_s[:, s]
         changes = uniform[:, :, s, 0] > torch.exp(-switching.rate * duration)[:, None]
         model = torch.where(changes, choice[:, :, s], model)
         if switching.models.num_states > 4:
-            # the noise of motion leaves the numbers of a constant centre unused
-            entered = entry[model] @ state[..., None] + entry_root[model] @ normal[:, :, s, :, None]
-            state = torch.where(changes[..., None], entered[..., 0], state)
-        matrix, noise = steps[s]
-        scale = noise.diagonal(dim1=-2, dim2=-1)
-        root = torch.linalg.cholesky(noise + torch.diag_embed(_JITTER * (scale + scale.amax(-1, keepdim=True)) + 1e-18))
-        # no time, no noise: steps before the last detection must leave the state as it is
-        root = root * (duration > 0)[:, None, None, None]
+            # a centre begins about the target (`_entry`); the noise of motion leaves the numbers of a constant centre unused
+            begins = (changes & switching.models.has_home[model])[..., None]
+            centre = state[..., :2] + switching.models.home_range[model][..., None] * normal[:, :, s, 4:6]
+            state = torch.cat([state[..., :4], torch.where(begins, centre, state[..., 4:6])], -1)
+        matrix, _ = steps[s]
+        root = steps.chosen(s, *roots, 0.0)  # no time, no noise: before the last detection the state is left as it is
         state = (matrix[rows, model] @ state[..., None])[..., 0] + (root[rows, model] @ normal[:, :, s, :, None])[..., 0]
         positions.append(state[..., :2])
     return torch.stack(positions, 2)
@@ -145,12 +145,24 @@ class _Steps:
     def __getitem__(self, step: int) -> tuple[Tensor, Tensor]:
         """Matrices and noise [R, C, S, S] at one step."""
         (matrix, noise), (part_matrix, part_noise) = self.whole, self.part
+        eye = torch.eye(matrix.shape[-1], dtype=torch.float64)
+        return self.chosen(step, matrix, part_matrix, eye), self.chosen(step, noise, part_noise, 0.0)
+
+    def roots(self) -> tuple[Tensor, Tensor]:
+        """Cholesky factors of the noise of a whole step [C, S, S], and of the rest of the first one [R, C, S, S]."""
+        # where all of the time lies before the last detection a whole step is none, and has no noise
+        return _root(self.whole[1]) * bool(self.durations_s.amax() > 0), _root(self.part[1])
+
+    def chosen(self, step: int, whole: Tensor, part: Tensor, nothing: Tensor | float) -> Tensor:
+        """What holds at a step [R, C, S, S], of what holds for a whole one, for the rest of the first one, and before it."""
         is_whole = self.is_whole[:, step]
         if bool(is_whole.all()):
-            return matrix.expand_as(part_matrix), noise.expand_as(part_noise)
-        is_whole, goes_on = is_whole[:, None, None, None], (self.durations_s[:, step] > 0)[:, None, None, None]
-        eye = torch.eye(matrix.shape[-1], dtype=torch.float64)
-        return (
-            torch.where(is_whole, matrix, torch.where(goes_on, part_matrix, eye)),
-            torch.where(is_whole, noise, torch.where(goes_on, part_noise, 0.0)),
-        )
+            return whole.expand_as(part)
+        goes_on = (self.durations_s[:, step] > 0)[:, None, None, None]
+        return torch.where(is_whole[:, None, None, None], whole, torch.where(goes_on, part, nothing))
+
+
+def _root(noise: Tensor) -> Tensor:
+    scale = noise.diagonal(dim1=-2, dim2=-1)
+    root: Tensor = torch.linalg.cholesky(noise + torch.diag_embed(_JITTER * (scale + scale.amax(-1, keepdim=True)) + 1e-18))
+    return root

@@ -21,6 +21,7 @@ from pipeline.estimators.loaded import Loaded
 from pipeline.estimators.presets import load_estimator
 from pipeline.infer.config import InferConfig
 from pipeline.infer.draws import Piece, draw_associations, draw_tracks, draw_windows
+from pipeline.progress import Progress
 from pipeline.stream_words import stream_words
 from pipeline.suspicions import Suspicions
 from pipeline.windows import MissionWindows, build_windows
@@ -44,11 +45,11 @@ class Seen:
     associated: AssociatedWindows | None
 
     @staticmethod
-    def of(config: InferConfig, detections: pa.Table, loaded: Loaded) -> "Seen":
+    def of(config: InferConfig, detections: pa.Table, loaded: Loaded, progress: Progress) -> "Seen":
         """The windows of a log on the grid that the model takes."""
         sigma_m, association = config.default_sigma_m, config.association if config.is_associated else None
         grid = loaded.grid(config.grid)
-        sources = tell_sources(detections, grid, association, config.seed, sigma_m, config.guidance.max_speed_mps)
+        sources = tell_sources(detections, grid, association, config.seed, sigma_m, config.guidance.max_speed_mps, progress)
         named = build_windows(sources.named, sources.grid, config.seed, sigma_m)
         if sources.association is None:
             return Seen(sources, named, None)
@@ -92,17 +93,17 @@ class Plan:
         return [words] if words else []
 
     @staticmethod
-    def of(config: InferConfig, detections: pa.Table, beside: Beside) -> "Plan":
+    def of(config: InferConfig, detections: pa.Table, beside: Beside, progress: Progress) -> "Plan":
         """The draws of a log by the checkpoint, which decides the grid as well, or by the default one where it does not fit."""
         loaded = load_estimator(config.checkpoint, config.samplings)
-        seen = Seen.of(config, detections, loaded)
+        seen = Seen.of(config, detections, loaded, progress)
         data = FittingData.of(seen.sources.named, seen.sources.grid, seen.named, config.default_sigma_m)
         suspicions, about = Suspicions(), seen.about(config.association)
         if config.is_tested and loaded.fit is None:
             test = fit_test(loaded.estimator, data, seen.named.located(beside.start_ns, beside.obstacles))
             if test is not None and test.is_misfit:
                 _suspect(test, config, suspicions)
-                plan = Plan.of(replace(config, checkpoint=DEFAULT), detections, beside)
+                plan = Plan.of(replace(config, checkpoint=DEFAULT), detections, beside, progress)
                 return replace(plan, suspicions=suspicions, about={**plan.about, "fit_test": asdict(test)})
             about["fit_test"] = None if test is None else asdict(test)
         fitted = loaded.fitted(data)

@@ -21,6 +21,8 @@ from pipeline.tables import Frame, read_table, write_table
 from pipeline.threads import in_order, num_cores, one_thread
 
 _MANY_NAMELESS = 2000
+_SHARE_APART = 0.4
+"""Of the time, what telling detections apart takes where there is something to tell apart."""
 _FIRST_S, _LONG_S = 5.0, 120.0
 """After how long one knows what is ahead, and from when on somebody who waits wants to have been told."""
 
@@ -36,12 +38,14 @@ def write_tables(
             'the other, which takes a while; agent = "NAME" in [[extract.detections]] means one target, --start and --end '
             "take a part"
         )
+    beside = Beside(start_ns, read_obstacles(directory / OBSTACLES_NAME))
     with one_thread():
-        plan = Plan.of(config, detections, Beside(start_ns, read_obstacles(directory / OBSTACLES_NAME)))
+        plan = Plan.of(config, detections, beside, progress.part(0.0, _SHARE_APART))
         for line in plan.suspicions.lines():
             progress.note(f"infer: suspected {line}")
         drawn = in_order(plan.draws, num_threads or num_cores())
-        summary = _draw(plan, drawn, str(detections["log_id"][0]), folder, frame, progress)
+        drawing = progress if plan.seen.associated is None else progress.part(_SHARE_APART, 1.0)
+        summary = _draw(plan, drawn, str(detections["log_id"][0]), folder, frame, drawing)
     if plan.seen.sources.association is not None:
         found = plan.seen.sources.association.rows(detections)
         write_table(found, folder / "associations.parquet", "associations", frame)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from cadence.association.history import Step, drawn_associations, grouped, recently, step_of
+from cadence.association.history import Ending, Step, drawn_associations, grouped, recently, step_of
 from cadence.association.motion import Modes, motion
 from cadence.association.particles import Stream, continuations, follow
 from cadence.association.presence import Habits, left_by, log_hazards, log_silence, log_silence_between
@@ -112,11 +112,35 @@ def test_pasts_are_drawn_by_their_shares_under_the_childs_names():
         step_of(np.ones(1), np.array([0]), np.array([0]), np.array([0]), np.array([[0, 1]]), np.array([0]))[0],
         Step(np.array([0, 1]), np.array([0, 0]), np.ones(2), np.array([1, 1]), np.array([0, 1]), np.array([[0, 1], [1, 0]])),
     ]
-    label = drawn_associations([*first, step], np.zeros(4000, dtype=np.int64), np.random.default_rng(0))
+    label = drawn_associations([*first, step], [Ending(3, np.zeros(4000, dtype=np.int64), np.random.default_rng(0))])[0]
     np.testing.assert_array_equal(label[:, 2], 0)
     different, count = np.unique(label, axis=0, return_counts=True)
     assert len(different) == 2
     np.testing.assert_allclose(np.sort(count) / 4000, [0.25, 0.75], atol=0.03)
+
+
+def test_what_an_ending_is_given_does_not_depend_on_the_others():
+    """Two detections a scan of two agents that stay close: many pasts. Together, alone, and in parts: the same labels."""
+    *_, last = follow(stream(90, seed=4), habits(), 20, seed=0)
+    particle = np.arange(len(last.weight))
+
+    def ending(num_steps, seed):
+        return Ending(num_steps, particle if num_steps == 90 else np.zeros(7, dtype=np.int64), np.random.default_rng(seed))
+
+    numbers = [(40, 1), (90, 2), (65, 3)]
+    together = drawn_associations(last.steps, [ending(*number) for number in numbers])
+    for number, label in zip(numbers, together, strict=True):
+        (alone,) = drawn_associations(last.steps, [ending(*number)])
+        np.testing.assert_array_equal(label, alone)
+        assert label.shape[1] == number[0]
+    assert len(np.unique(together[1], axis=0)) > 5
+
+
+def test_particles_share_the_tracks_on_which_they_agree():
+    """Of the tracks of 30 particles, most are common: there are far fewer than particles times agents."""
+    *_, last = follow(stream(60, seed=4), habits(), 30, seed=0)
+    assert last.tracks.row.shape == (30, 2) and last.tracks.row.min() >= 1
+    assert len(last.tracks.last_s) - 1 == len(np.unique(last.tracks.row)) < 40
 
 
 def test_nobody_exceeds_the_speed_limit():
@@ -150,7 +174,7 @@ def test_densities_of_one_track_are_those_of_a_joint_gaussian():
     for index, time_s in enumerate(seen.time_s):
         detection = Detection(time_s, seen.position_m[index], seen.covariance_m2[index])
         if index:
-            total += log_densities(tracks, ONE, detection)[0, 0]
+            total += log_densities(tracks, ONE, detection)[1]
         tracks = updated(tracks, ONE, detection, np.array([0]))
     gap = np.diff(seen.time_s)
     first, second = motion(ONE, gap[0]), motion(ONE, gap[1])
@@ -175,10 +199,10 @@ def test_mixing_keeps_mean_and_covariance_of_the_whole():
         for index, time_s in enumerate(seen.time_s[:2]):
             detection = Detection(time_s, seen.position_m[index], seen.covariance_m2[index])
             tracks = updated(tracks, modes, detection, np.array([0]))
-        share, mean = np.exp(tracks.log_share[0, 0]), tracks.mean[0, 0]
+        share, mean = np.exp(tracks.log_share[1]), tracks.mean[1]
         overall = share @ mean
         apart = mean - overall
-        total = np.einsum("c,cij->ij", share, tracks.covariance[0, 0] + apart[:, :, None] * apart[:, None])
+        total = np.einsum("c,cij->ij", share, tracks.covariance[1] + apart[:, :, None] * apart[:, None])
         results.append((overall, total))
     np.testing.assert_allclose(results[0][0], results[1][0], rtol=1e-9)
     np.testing.assert_allclose(results[0][1], results[1][1], rtol=1e-9, atol=1e-9)
@@ -189,12 +213,12 @@ def test_silence_and_the_next_detection_are_one_law():
     tracks = updated(Tracks.none(2), TWO, Detection(0.0, np.zeros(2), np.eye(2)), np.array([0]))
     moments = np.linspace(0.0, 3000.0, 300_001)
     stays = habits()
-    density = np.exp([log_silence(tracks, stays, moment)[1][0, 0] for moment in moments[::100]])
-    silence = np.exp([log_silence(tracks, stays, moment)[0][0, 0] for moment in moments[::100]])
+    density = np.exp([log_silence(tracks, stays, moment)[1][1] for moment in moments[::100]])
+    silence = np.exp([log_silence(tracks, stays, moment)[0][1] for moment in moments[::100]])
     np.testing.assert_allclose(silence, 1.0 - np.concatenate([[0], np.cumsum(0.5 * (density[1:] + density[:-1]))]), atol=2e-4)
-    leaves = np.exp(log_silence(tracks, habits(leave_hz=0.01), 1e7)[0][0, 0])
+    leaves = np.exp(log_silence(tracks, habits(leave_hz=0.01), 1e7)[0][1])
     assert 0.0 < leaves < 1.0
-    assert np.exp(log_silence(tracks, stays, 1e7)[0][0, 0]) < 1e-5
+    assert np.exp(log_silence(tracks, stays, 1e7)[0][1]) < 1e-5
 
 
 def test_new_agents_are_met_as_often_as_their_rate_says():
@@ -212,7 +236,7 @@ def test_who_is_silent_for_long_has_left_rather_than_stayed():
     seen, about = updated(Tracks.none(2), TWO, Detection(0.0, np.zeros(2), np.eye(2)), np.array([0])), habits(leave_hz=0.001)
     moments = np.linspace(0.0, 1500.0, 30_001)
     # by Bayes: the share of leaving times that lie before the end, among all ways to be silent
-    staying = np.exp([log_silence(seen, habits(), moment)[0][0, 0] for moment in moments])
+    staying = np.exp([log_silence(seen, habits(), moment)[0][1] for moment in moments])
     leaving = np.trapezoid(about.leave_hz * np.exp(-about.leave_hz * moments) * staying, moments)
     stayed = np.exp(-about.leave_hz * moments[-1]) * staying[-1]
     assert left_by(seen, about, 0.0)[0, 0] == 0.0
@@ -226,5 +250,5 @@ def test_an_agents_rate_is_relearned_where_rates_change():
         for time_s in np.concatenate([10.0 * np.arange(10), 90.0 + 100.0 * np.arange(1, 21)]):
             tracks = updated(tracks, TWO, Detection(time_s, np.zeros(2), np.eye(2)), np.array([0]), memory)
         about = dataclasses.replace(habits(), rate_weight=1.0)
-        rate_hz = np.exp(log_silence(tracks, about, float(tracks.last_s[0, 0]))[1][0, 0])
+        rate_hz = np.exp(log_silence(tracks, about, float(tracks.last_s[1]))[1][1])
         assert fewest < rate_hz < most

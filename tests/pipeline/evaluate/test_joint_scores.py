@@ -129,7 +129,9 @@ def truth(*ships: tuple[str, float]) -> pa.Table:
     return pa.Table.from_pylist(rows, schema=TRUTH)
 
 
-def two_associations(time_s, position_m, covariance_m2, origins_s, config, seed, habits=None) -> list[AssociationHypotheses]:
+def two_associations(
+    time_s, position_m, covariance_m2, origins_s, config, seed, habits=None, **_
+) -> list[AssociationHypotheses]:
     label = np.stack([TRUE, SWAPPED])
     return [AssociationHypotheses(label[:, : int((time_s <= origin).sum())], np.array([0.75, 0.25]), 2) for origin in origins_s]
 

@@ -37,7 +37,7 @@ from pipeline.infer.config import InferConfig
 from pipeline.infer.draws import draw_associations
 from pipeline.infer.stage import infer
 from pipeline.logs.reader import open_log
-from pipeline.progress import Progress, RelayedProgress
+from pipeline.progress import Doing, Progress, RelayedProgress
 from pipeline.report.config import ReportConfig
 from pipeline.report.stage import report
 from pipeline.results import read_hypothesis_tables
@@ -49,7 +49,9 @@ from schemas.tables import ASSOCIATIONS, LABELS
 QUIET = Progress(quiet=True)
 
 
-def three_associations(time_s, position_m, covariance_m2, origins_s, config, seed, habits=None) -> list[AssociationHypotheses]:
+def three_associations(
+    time_s, position_m, covariance_m2, origins_s, config, seed, habits=None, **_
+) -> list[AssociationHypotheses]:
     """The truth; one detection given to the other agent; one taken for clutter."""
     label = np.stack([TRUE, SWAPPED, CLUTTERED])[:, : len(time_s)]
     return [AssociationHypotheses(label[:, : int((time_s <= origin).sum())], WEIGHT, 2) for origin in origins_s]
@@ -160,6 +162,19 @@ def test_that_many_detections_have_no_name_is_said_before_one_waits(tmp_path: Pa
     assert note.startswith("infer: 16 detections") and 'agent = "NAME"' in note
 
 
+def test_how_far_telling_apart_is_comes_before_the_windows(tmp_path: Path) -> None:
+    told: list[object] = []
+    config = dataclasses.replace(CONFIG, association=AssociationConfig(num_particles=8))
+    infer(mission(tmp_path, detections()), config, RelayedProgress(tell=told.append))
+    shares = [share for share in told if isinstance(share, float)]
+    assert shares == sorted(shares) and shares[-1] == 1.0
+    apart = next(number for number, one in enumerate(told) if isinstance(one, Doing) and "tell apart" in one)
+    windows = next(number for number, one in enumerate(told) if isinstance(one, Doing) and one.startswith("infer"))
+    assert apart < windows
+    before = [share for share in told[:windows] if isinstance(share, float)]
+    assert len(before) > 10 and before[-1] == pytest.approx(0.4)
+
+
 @pytest.mark.usefixtures("stand_in")
 def test_table_of_associations(tmp_path: Path) -> None:
     directory = mission(tmp_path, detections())
@@ -177,7 +192,7 @@ def test_table_of_associations(tmp_path: Path) -> None:
 
 
 def test_an_agent_may_be_missing_from_a_hypothesis(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def associate(time_s, position_m, covariance_m2, origins_s, config, seed, habits=None) -> list[AssociationHypotheses]:
+    def associate(time_s, position_m, covariance_m2, origins_s, config, seed, habits=None, **_) -> list[AssociationHypotheses]:
         label = np.stack([TRUE, np.where(TRUE == 1, -1, 0)])
         return [AssociationHypotheses(label[:, : int((time_s <= o).sum())], np.array([0.75, 0.25]), 3) for o in origins_s]
 
@@ -209,7 +224,7 @@ def test_named_agents_stay_what_they_are(tmp_path: Path) -> None:
 
 
 def test_all_of_it_clutter_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def associate(time_s, position_m, covariance_m2, origins_s, config, seed, habits=None) -> list[AssociationHypotheses]:
+    def associate(time_s, position_m, covariance_m2, origins_s, config, seed, habits=None, **_) -> list[AssociationHypotheses]:
         return [AssociationHypotheses(np.full((1, int((time_s <= o).sum())), -1), np.ones(1), 0) for o in origins_s]
 
     monkeypatch.setattr(associations, "associate", associate)
@@ -240,7 +255,7 @@ def test_side_file_and_page_tell_of_agents_and_sources(tmp_path: Path, monkeypat
     table = table.set_column(column, table.schema.field(column), pa.nulls(len(true), pa.string()))
     write_table(table, directory / "detections.parquet", "detections", frame)
 
-    def associate(time_s, position_m, covariance_m2, origins_s, config, seed, habits=None) -> list[AssociationHypotheses]:
+    def associate(time_s, position_m, covariance_m2, origins_s, config, seed, habits=None, **_) -> list[AssociationHypotheses]:
         label = np.stack([true, np.where(np.arange(len(true)) % 5 == 0, -1, true), np.where(true == 1, -1, true)])
         return [AssociationHypotheses(label[:, : int((time_s <= o).sum())], np.array([0.5, 0.25, 0.25]), 2) for o in origins_s]
 

@@ -91,7 +91,9 @@ def rename_truth(directory: Path, names: dict[str, str]) -> pa.Table:
     return table
 
 
-def two_associations(time_s, position_m, covariance_m2, origins_s, config, seed, habits=None) -> list[AssociationHypotheses]:
+def two_associations(
+    time_s, position_m, covariance_m2, origins_s, config, seed, habits=None, **_
+) -> list[AssociationHypotheses]:
     label = np.stack([TRUE, SWAPPED])
     return [AssociationHypotheses(label[:, : int((time_s <= origin).sum())], np.array([0.75, 0.25]), 2) for origin in origins_s]
 
