@@ -301,7 +301,7 @@ def export(
 
     The side file NAME.cadence.mcap, to be opened together with the log, and a layout to import. With --to nothing of that, but
     tracks with their times and weights, means, and regions that hold 50 and 90 %; formats: geoparquet, geojson, kml, czml,
-    gpx, cot. All but geoparquet need latitude and longitude.
+    gpx, cot, rerun (a blueprint). All but geoparquet and rerun need latitude and longitude.
 
     \b
     Examples:

@@ -158,7 +158,7 @@ def _map_config(style: Style, source: Sequence[CatalogueChannel], topics: Sequen
     return {
         "layer": "map",
         "customTileUrl": "",
-        "disabledTopics": [],
+        "disabledTopics": [channels.FIXES.topic] * (channels.FIXES.topic in topics),  # the map draws all of a topic at once
         "followTopic": "",
         "topicColors": colors,
         "zoomLevel": _zoom_level(style.extent_m),

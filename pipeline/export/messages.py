@@ -9,7 +9,7 @@ import numpy as np
 
 from pipeline.ask.events import Event
 from pipeline.export import numbers
-from pipeline.export.occupancy import Occupancy, future_occupancy
+from pipeline.export.occupancy import Occupancy
 from pipeline.export.playback import LiveAgent, Tick
 from pipeline.logs.wire import field
 from pipeline.logs.writer import foxglove_class
@@ -109,12 +109,11 @@ def encode_detection(row: dict[str, Any], frame: Frame, time_ns: int, sources: S
     return data
 
 
-def encode_occupancy(tick: Tick, frame: Frame, time_ns: int, max_cells: int, z_m: float) -> bytes:
+def encode_occupancy(found: Occupancy | None, frame: Frame, time_ns: int, z_m: float) -> bytes:
     """foxglove.Grid: how likely each place is to be visited until the end of the future; one clear cell without an agent.
 
     A cell holds the probability (float32) and a colour for viewers that show colours by default (clear where never visited).
     """
-    found = future_occupancy(tick.scene.live if tick.scene else (), max_cells)
     found = found or Occupancy(0.0, 0.0, 1.0, np.zeros((1, 1)))
     probability = found.probability
     cells = np.zeros(probability.shape, dtype=[("probability", "<f4"), ("rgb", "u1", (3,)), ("alpha", "u1")])

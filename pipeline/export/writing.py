@@ -11,13 +11,16 @@ from pipeline.ask.told import ANSWERS_NAME, EVENTS_NAME, Told, tell
 from pipeline.catalogue import Catalogue
 from pipeline.config import config_as_dict
 from pipeline.export import maps, messages
+from pipeline.export.clouds import encode_cloud, encode_fixes, plan_clouds
 from pipeline.export.config import ExportConfig
 from pipeline.export.display import hypothesis_entities, obstacle_entities, present_entities
 from pipeline.export.inputs import EARLIER_STAGES
 from pipeline.export.layouts import MAX_PLOTTED, build_layout, build_legacy_layout
 from pipeline.export.mission import Exported, read_exported
+from pipeline.export.occupancy import future_occupancy
 from pipeline.export.playback import Tick, shows_new_scene
 from pipeline.export.scene import encode_scene
+from pipeline.export.voxels import encode_voxels
 from pipeline.logs.append import write_combined
 from pipeline.logs.recorder import Packing
 from pipeline.logs.writer import LogWriter
@@ -97,6 +100,7 @@ def _in_order(mission: Exported, events: Sequence[Event], config: ExportConfig) 
     moments.sort()
     map_start_ns = maps.plan_map(ticks, config.map_period_s) if frame.is_georeferenced else {}
     fixes = maps.MovingFixes(frame, mission.style)
+    clouds = plan_clouds(ticks, windows, mission.style.num_hypotheses, frame.is_georeferenced)
     if moments:
         yield from _static(mission, moments[0][0] + mission.clock_offset_ns)
     for moment_ns, kind, index in moments:
@@ -112,6 +116,10 @@ def _in_order(mission: Exported, events: Sequence[Event], config: ExportConfig) 
             if shows_new_scene(ticks, index):
                 yield from _new_scene(mission, tick, time_ns, config, map_start_ns.get(index))
             yield from _tick(mission, tick, time_ns)
+            if index in clouds.clouds:
+                yield time_ns, channels.CLOUD, encode_cloud(tick, frame, mission.style, time_ns)
+            if index in clouds.fixes:
+                yield time_ns, channels.FIXES, encode_fixes(tick, frame, mission.style, time_ns)
             if frame.is_georeferenced and tick.scene is not None:
                 for agent_id, data in fixes.at(tick.scene, tick.time_ns, time_ns):
                     yield time_ns, channels.fix_channel(agent_id), data
@@ -141,7 +149,9 @@ def _new_scene(
 ) -> Iterator[_Message]:
     """What stands until the next windows; every topic clears what it showed before, so that one may seek."""
     frame, style, scene = mission.hypotheses.frame, mission.style, tick.scene
-    yield time_ns, channels.OCCUPANCY, messages.encode_occupancy(tick, frame, time_ns, config.occupancy_cells, style.z_m)
+    found = future_occupancy(scene.live if scene else (), config.occupancy_cells)
+    yield time_ns, channels.OCCUPANCY, messages.encode_occupancy(found, frame, time_ns, style.z_m)
+    yield time_ns, channels.VOXELS, encode_voxels(found, frame, time_ns, style.z_m)
     entities = hypothesis_entities(scene, mission.marks, style) if scene else ()
     yield time_ns, channels.SCENE, encode_scene(time_ns, frame.frame_id, entities)
     if scene is not None and map_start_ns is not None:

@@ -10,7 +10,10 @@ import foxglove_schemas_protobuf.FrameTransform_pb2 as frame_transform
 import foxglove_schemas_protobuf.GeoJSON_pb2 as geojson
 import foxglove_schemas_protobuf.Grid_pb2 as grid
 import foxglove_schemas_protobuf.LocationFix_pb2 as location_fix
+import foxglove_schemas_protobuf.LocationFixes_pb2 as location_fixes
+import foxglove_schemas_protobuf.PointCloud_pb2 as point_cloud
 import foxglove_schemas_protobuf.SceneUpdate_pb2 as scene_update
+import foxglove_schemas_protobuf.VoxelGrid_pb2 as voxel_grid
 from google.protobuf import descriptor_pb2
 
 from pipeline.logs.index import Index
@@ -28,7 +31,10 @@ _FOXGLOVE = {
         "GeoJSON": geojson,
         "Grid": grid,
         "LocationFix": location_fix,
+        "LocationFixes": location_fixes,
+        "PointCloud": point_cloud,
         "SceneUpdate": scene_update,
+        "VoxelGrid": voxel_grid,
     }.items()
 }
 

@@ -1,18 +1,16 @@
-"""A colour for each agent: hues as far apart as there are agents."""
+"""A colour for each agent, the same as in the side file and in the report."""
 
-import colorsys
 from collections.abc import Sequence
 
-_GOLDEN = 0.6180339887498949
-_FIRST = 0.58
+from pipeline.export.display import agent_hue
 
 
 def colors(agent_ids: Sequence[str]) -> dict[str, tuple[int, int, int]]:
     """Red, green and blue from 0 to 255, by agent."""
     found = {}
     for number, agent_id in enumerate(agent_ids):
-        parts = colorsys.hsv_to_rgb((_FIRST + number * _GOLDEN) % 1.0, 0.75, 0.85)
-        found[agent_id] = (round(255 * parts[0]), round(255 * parts[1]), round(255 * parts[2]))
+        red, green, blue = bytes.fromhex(agent_hue(number).removeprefix("#"))
+        found[agent_id] = (red, green, blue)
     return found
 
 

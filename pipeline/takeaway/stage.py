@@ -16,6 +16,7 @@ from pipeline.takeaway.geojson import geojson_text
 from pipeline.takeaway.geoparquet import write_regions, write_steps
 from pipeline.takeaway.gpx import gpx_text
 from pipeline.takeaway.kml import kml_text
+from pipeline.takeaway.rerun_blueprint import write_blueprint
 
 NUM_DRAWN = 30
 """Hypotheses in formats that are drawn; GeoParquet holds all."""
@@ -28,7 +29,7 @@ _TEXTS: dict[str, tuple[str, Callable[[Answer, int], Iterator[str]]]] = {
     "cot": ("cot", lambda answer, number: cot_text(answer)),
 }
 """The ending and the text of each format that needs latitude and longitude."""
-FORMATS = ("geoparquet", *_TEXTS)
+FORMATS = ("geoparquet", *_TEXTS, "rerun")
 
 
 @dataclass(frozen=True)
@@ -90,6 +91,12 @@ def _write(answer: Answer, name: str, folder: Path, num_hypotheses: int | None) 
         with replacing(regions) as draft:
             write_regions(answer, draft)
         yield from (steps, regions)
+        return
+    if name == "rerun":
+        path = folder / f"{answer.name}.rbl"
+        with replacing(path) as draft:
+            write_blueprint(answer, draft)
+        yield path
         return
     ending, text = _TEXTS[name]
     path = folder / f"{answer.name}.{ending}"

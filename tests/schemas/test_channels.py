@@ -43,7 +43,7 @@ def test_field_numbers_are_never_changed():
 
 def test_topics_are_unique_and_ours():
     found = [value for value in vars(channels).values() if isinstance(value, Channel)]
-    assert len({channel.topic for channel in found}) == len(found) == 10
+    assert len({channel.topic for channel in found}) == len(found) == 13
     assert all(channel.topic.startswith("/cadence/") for channel in found)
 
 

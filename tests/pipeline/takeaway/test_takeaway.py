@@ -1,6 +1,10 @@
 """Files for other programs, each read back by a reader of its own: places to .1 m, times to 1 ms, weights and regions."""
 
+import importlib.util
 import json
+import shutil
+import subprocess
+import sys
 import xml.etree.ElementTree as ET
 from datetime import UTC, datetime
 from pathlib import Path
@@ -30,7 +34,7 @@ from pipeline.takeaway.thinned import thinned
 QUIET = Progress(quiet=True)
 START_NS = 1_700_000_000_000_000_000
 PLACE_M, TIME_NS = 0.1, 1_000_000
-NS = "{http://www.topografix.com/GPX/1/1}"
+RERUN = shutil.which("rerun", path=str(Path(sys.executable).parent)) or "rerun"
 
 
 def write_mission_hypotheses(directory: Path, frame: Frame, has_height: bool = True) -> Stories:
@@ -327,10 +331,23 @@ def test_wrong_calls(mission, tmp_path, capsys):
     bare = build_mission(tmp_path)
     with pytest.raises(InputError, match="cadence retrospect"):
         take_away(bare, ["geoparquet"], None, None, "mission", QUIET)
-    assert set(FORMATS) == {"geoparquet", "geojson", "kml", "czml", "gpx", "cot"}
+    assert set(FORMATS) == {"geoparquet", "geojson", "kml", "czml", "gpx", "cot", "rerun"}
     assert (
         cli.main(["export", str(mission), "--to", "gpx", "--out", str(tmp_path / "new"), "--json", "-q", "--hypotheses", "1"])
         == 0
     )
     assert json.loads(capsys.readouterr().out)["files"] == [str(tmp_path / "new" / "patrol.gpx")]
     assert len(coordinates(GEOREFERENCED, np.zeros((1, 2)))) == 1
+
+
+def test_a_blueprint_for_rerun_or_the_line_that_says_what_it_needs(mission, tmp_path):
+    if importlib.util.find_spec("rerun") is None:
+        with pytest.raises(UsageError, match="needs rerun-sdk"):
+            take_away(mission, ["rerun"], tmp_path, None, None, QUIET)
+        assert not list(tmp_path.iterdir())
+        return
+    (path,) = take_away(mission, ["rerun"], tmp_path, None, None, QUIET).files
+    told = subprocess.run([RERUN, "rrd", "print", "-vv", path], capture_output=True, text=True, check=True).stdout
+    assert all(
+        words in told for words in ("ViewContents:query", "SpatialInformation:target_frame", "TimePanelBlueprint:timeline")
+    )
