@@ -94,6 +94,7 @@ class ChannelReader:
             for name, located in found:
                 values[name] = located[place] if place in located else at_place(located, place)
             covariance = self._covariance(values["covariance"], values["covariance_type"], values["sigma"])
+            self.counts["text"] += isinstance(first, str) and math.isnan(_number(first))
             time_ns = default_ns if values["time"] is None else values["time"]
             self.rows.integers.extend((time_ns, raw.log_time_ns, raw.sequence, self.counts["messages"]))
             self.rows.floats.extend((_number(first), _number(second), _number(z), _number(values["score"]), *covariance))

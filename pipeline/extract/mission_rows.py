@@ -138,6 +138,11 @@ def _check_any(role: str, rows: Positions, counts: Counter[str], suspicions: Sus
             f"for none of the {role} the log has a transform near enough in time; "
             "raise extract.max_extrapolation_s and extract.max_transform_gap_s, or check the stamps"
         )
+    elif counts["text"] and counts["text"] == counts["dropped_nonfinite"]:
+        reason = (
+            "every position is text that is no number, as with a decimal comma, or degrees, minutes and seconds; let the "
+            "recorder write numbers, or bring the positions in as a table with cadence import"
+        )
     elif counts["dropped_nonfinite"]:
         reason = "every position is NaN, infinite or off the earth; check the recorder, or map another topic"
     elif counts["undecodable"]:

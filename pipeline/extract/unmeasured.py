@@ -93,7 +93,7 @@ def with_rounding(rows: Positions, role: str, is_told: bool, suspicions: Suspici
         return rows
     suspicions.add(
         "place", str(rows.topic[0]),
-        seen=f"no position has more than {counted(decimals, 'decimal')} of a degree: they are rounded to {step_m:.3g} m",
+        seen=f"no position has more than {counted(decimals, 'decimal')} of a degree: they are rounded to {step_m:.0f} m",
         done=f"a standard deviation of {north2**0.5:.3g} m is taken",
         setting=f'sigma_m in its [[extract.{role}]], or extract.trusted = ["place"]',
     )  # fmt: skip

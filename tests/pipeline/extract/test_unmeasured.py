@@ -5,7 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from fixtures.small_logs import Row, detection, fix
-from test_extract import run
+from test_extract import fails, run
+
+from cadence.errors import InputError
 
 NUM = 120
 
@@ -97,3 +99,10 @@ def test_a_coordinate_that_runs_over_its_field_is_named(tmp_path: Path, unit_m: 
     assert [each["seen"].split(",")[0] for each in told] == [f"x jumps 2 times by {2**16 * unit_m:g} m"]
     wide = run(tmp_path, seen(counts * unit_m, agent=agent)).summary["suspicions"]
     assert not [each for each in wide if "16 bits" in each["seen"]]
+
+
+@pytest.mark.parametrize("text", ["48,1", "48°06'00\"N", "unknown"])
+def test_text_that_is_no_number_is_called_so(tmp_path: Path, text: str) -> None:
+    rows = [fix(float(i), text, "11,6") for i in range(5)]
+    fails(tmp_path, rows, InputError, "every position is text that is no number")
+    assert run(tmp_path, [fix(float(i), "48.1", "11.6") for i in range(5)]).summary["num_detections"] == 5
