@@ -79,13 +79,19 @@ def wilson(share: float, num: float) -> tuple[float, float]:
     return max(middle - half, 0.0), min(middle + half, 1.0)
 
 
-def law(weight: Float64s, value: Float64s) -> Law | None:
-    """Law of `value` [K] over stories of weights [K], those left out in which it is NaN; None where it is in all."""
+def law(weight: Float64s, value: Float64s, give_or_take: Float64s | None = None) -> Law | None:
+    """Law of `value` [K] over stories of weights [K], those left out in which it is NaN; None where it is in all.
+
+    Where each value is known to within `give_or_take` [K] only, half of the weight lies at either end of that.
+    """
     is_there = np.isfinite(value) & (weight > 0)
     if not is_there.any():
         return None
     weight, value = weight[is_there], value[is_there]
     num = effective_number(weight)
+    if give_or_take is not None:
+        value = np.concatenate([value - give_or_take[is_there], value + give_or_take[is_there]])
+        weight = np.concatenate([weight, weight])
     levels = np.array([0.05, 0.5, 0.95, *wilson(0.5, num)])
     low, median, high, median_low, median_high = quantiles(weight, value, levels).tolist()
     return Law(low, median, high, median_low, median_high, num)

@@ -96,8 +96,8 @@ def inside(stories: Stories, agent: int, area: Area, span_s: Span, dwell_s: floa
         dwelt=probability(weight, stays.lasting(dwell_s).is_any),
         at_start=probability(weight, at_start),
         at_end=probability(weight, at_end),
-        first_entry_s=law(weight, np.where(at_start, np.nan, entry_s)),
-        left_s=law(weight, np.where(at_end, np.nan, last)),
+        first_entry_s=_times(cut.time_s, cut.position_m[:, 0], np.where(at_start, np.nan, entry_s), weight),
+        left_s=_times(cut.time_s, cut.position_m[:, 0], np.where(at_end, np.nan, last), weight),
         total_s=law(weight, np.where(ever, stays.total_s, np.nan)),
         longest_s=law(weight, np.where(ever, stays.longest_s, np.nan)),
     )
@@ -113,7 +113,11 @@ def arrive(stories: Stories, agent: int, area: Area, span_s: Span) -> Arrival:
     arrived = stays[~_appears(cut.time_s, track_m, stays)].after(float(cut.time_s[0])).first_s
     place_m, spread_m = _place(track_m, cut.time_s, arrived, weight)
     return Arrival(
-        probability(weight, np.isfinite(arrived)), probability(weight, was_there), law(weight, arrived), place_m, spread_m
+        probability(weight, np.isfinite(arrived)),
+        probability(weight, was_there),
+        _times(cut.time_s, track_m, arrived, weight),
+        place_m,
+        spread_m,
     )
 
 
@@ -135,7 +139,7 @@ def passed(stories: Stories, agent: int, line: Path, span_s: Span) -> Passage:
     return Passage(
         passed=probability(weight, did),
         to_right=probability(weight[did], first_right[did]),
-        passed_s=law(weight, first_s),
+        passed_s=_times(cut.time_s, cut.position_m[:, 0], first_s, weight),
         along_m=law(weight, where_m),
         num_crossings=law(weight, np.where(did, count, np.nan)),
     )
@@ -168,7 +172,7 @@ def meet(stories: Stories, one: int, other: int, within_m: float, for_s: float, 
     place_m, spread_m = _place(0.5 * (track_m[:, 0] + track_m[:, 1]), cut.time_s, stays.first_s, weight)
     return Meeting(
         met=probability(weight, stays.is_any),
-        met_s=law(weight, stays.first_s),
+        met_s=_times(cut.time_s, apart_m, stays.first_s, weight),
         lasted_s=law(weight, np.where(stays.is_any, stays.longest_s, np.nan)),
         nearest_m=law(weight, nearest_m(apart_m)),
         place_m=place_m,
@@ -185,6 +189,25 @@ def nearest_m(apart_m: Float64s) -> Float64s:
     near = start + share[..., None] * along
     distance = np.where(np.isnan(near).any(-1), np.inf, np.hypot(near[..., 0], near[..., 1])).min(axis=1)
     return np.where(np.isinf(distance), np.nan, distance)
+
+
+def _times(time_s: Float64s, track_m: Float64s, at_s: Float64s, weight: Float64s) -> Law | None:
+    """Law of times [K] at which tracks [K, T, 2] cross something, known as well as straight lines between steps tell them.
+
+    A track that bends by b within two steps strays by b / 8 from the line between them (the sagitta of an arc), and comes by as
+    much earlier or later: at most half a step.
+    """
+    if len(time_s) < 3:
+        return law(weight, at_s)
+    bend = np.full(track_m.shape[:2], 0.0)
+    bend[:, 1:-1] = np.nan_to_num(np.hypot(*np.moveaxis(np.diff(track_m, 2, axis=1), -1, 0)))
+    step_m = np.hypot(*np.moveaxis(np.diff(track_m, axis=1), -1, 0))
+    left = np.clip(np.searchsorted(time_s, np.nan_to_num(at_s, nan=time_s[0]), "right") - 1, 0, len(time_s) - 2)
+    rows = np.arange(len(at_s))
+    sagitta_m = np.minimum(bend[rows, left], bend[rows, left + 1]) / 8.0  # a corner at one end is no arc
+    with np.errstate(divide="ignore", invalid="ignore"):
+        share = np.nan_to_num(np.minimum(sagitta_m / step_m[rows, left], 0.5))
+    return law(weight, at_s, share * (time_s[left + 1] - time_s[left]))
 
 
 def _appears(time_s: Float64s, track_m: Float64s, stays: Visits) -> Bools:

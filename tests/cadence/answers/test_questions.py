@@ -52,6 +52,19 @@ def test_arrive():
     assert nobody.arrived.value == 0 and nobody.place_m is None and nobody.arrived_s is None
 
 
+def test_times_are_known_as_well_as_steps_tell_them():
+    """On a circle at 30 degrees a step the arc leads the chord to a border by up to its sagitta; stories that agree say so."""
+    angle = np.radians(30.0) * np.arange(13)
+    ring = 100.0 * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    time_s = tuple(10.0 * np.arange(13.0))
+    for border in (-20.0, 10.0, 45.0, 70.0):
+        area = Region(shapely.box(-500, -500, border, 500))
+        found = arrive(stories([tuple(point) for point in ring], time_s=time_s), 0, area, (0.0, 120.0))
+        truth = np.degrees(np.arccos(border / 100.0)) / 3.0
+        assert found.arrived_s.low - 0.05 <= truth <= found.arrived_s.high + 0.05
+        assert 0.1 < found.arrived_s.high - found.arrived_s.low < 2.0
+
+
 def test_who_appears_inside_did_not_come_over_the_border():
     appears = [(np.nan, np.nan), (5, 5), (6, 6)]
     found = arrive(stories(appears), 0, SQUARE, ALL)
