@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+import shapely
 
 from cadence.answers.whereabouts import whereabouts
 from cadence.arrays import Float64s, Int64s
@@ -23,6 +24,8 @@ Source = Literal["mission", "windows"]
 LEVELS = (0.9, 0.5)
 NUM_MOMENTS = 24
 """At which regions are given."""
+_SIMPLER = 0.003
+"""Of its width an outline may stray."""
 _MIN_MOMENTS, _MAX_REGIONS = 6, 600
 """Of a level: each takes a tenth of a second."""
 
@@ -243,5 +246,6 @@ def _regions(stretch: Stretch, agent: int, name: str, step: int, until_ns: int) 
     if not np.isfinite(position).all(axis=1).any():
         return
     for area in whereabouts(position, stretch.weight, LEVELS).areas:
-        if not area.shape.is_empty:
-            yield RegionAt(name, stretch.window, area.level, int(stretch.time_ns[step]), until_ns, area.shape)
+        shape = shapely.simplify(area.shape, _SIMPLER * area.area_m2**0.5)  # the outline has a corner a cell of a fine grid
+        if not shape.is_empty:
+            yield RegionAt(name, stretch.window, area.level, int(stretch.time_ns[step]), until_ns, shape)

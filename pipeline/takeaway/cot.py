@@ -12,7 +12,7 @@ import numpy as np
 from cadence.arrays import Float64s
 from pipeline.takeaway.answer import Answer, Track
 from pipeline.takeaway.degrees import DECIMALS, HEIGHT_DECIMALS, coordinates, iso
-from pipeline.takeaway.thinned import thinned
+from pipeline.takeaway.thinned import thin_means
 
 _TYPE, _HOW = "a-u-G", "m-f"
 _UNKNOWN = "9999999.0"
@@ -22,7 +22,7 @@ _LAST_S = 60
 
 def cot_text(answer: Answer) -> Iterator[str]:
     """Events of all agents by time."""
-    events = [event for track in answer.means() for event in _events(answer, thinned(track))]
+    events = [event for track in thin_means(answer) for event in _events(answer, track)]
     for _, line in sorted(events, key=lambda event: event[0]):
         yield line
 

@@ -10,13 +10,13 @@ from cadence.arrays import Float64s
 from pipeline.takeaway.answer import Answer, RegionAt, Track
 from pipeline.takeaway.colors import colors, opacity
 from pipeline.takeaway.degrees import HEIGHT_DECIMALS, iso, pieces, region_in_degrees, rings
-from pipeline.takeaway.thinned import thinned
+from pipeline.takeaway.thinned import thin_means, thin_tracks
 
 _SPEED = 60
 _TRAIL_S = 600
 
 
-def czml_text(answer: Answer, num_hypotheses: int | None) -> Iterator[str]:
+def czml_text(answer: Answer, num_hypotheses: int) -> Iterator[str]:
     """The document, a packet at a time."""
     start_ns, end_ns = int(answer.stretches[0].time_ns[0]), int(answer.stretches[-1].time_ns[-1])
     clock = {"interval": f"{iso(start_ns)}/{iso(end_ns)}", "currentTime": iso(start_ns), "multiplier": _SPEED}
@@ -26,14 +26,14 @@ def czml_text(answer: Answer, num_hypotheses: int | None) -> Iterator[str]:
     yield "\n]\n"
 
 
-def _packets(answer: Answer, num_hypotheses: int | None) -> Iterator[dict[str, Any]]:
+def _packets(answer: Answer, num_hypotheses: int) -> Iterator[dict[str, Any]]:
     hues = colors(answer.agent_ids)
-    tracks = list(answer.tracks(num_hypotheses))
+    tracks = thin_tracks(answer, num_hypotheses)
     heaviest = max((track.weight for track in tracks), default=1.0)
     numbers: dict[str, int] = {}
-    for track in (*tracks, *answer.means()):
+    for track in (*tracks, *thin_means(answer)):
         alpha = 1.0 if track.hypothesis is None else opacity(track.weight, heaviest)
-        for piece, place in pieces(answer.frame, thinned(track)):
+        for piece, place in pieces(answer.frame, track):
             number = numbers[track.name] = numbers.get(track.name, 0) + 1
             yield _track(piece, place, f"{track.name} {number}", [*hues[track.agent_id], round(255 * alpha)])
     for index, region in enumerate(answer.regions):

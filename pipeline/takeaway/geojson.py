@@ -10,10 +10,10 @@ import shapely
 from cadence.arrays import Float64s
 from pipeline.takeaway.answer import Answer, Track
 from pipeline.takeaway.degrees import DECIMALS, HEIGHT_DECIMALS, iso, pieces, region_in_degrees
-from pipeline.takeaway.thinned import thinned
+from pipeline.takeaway.thinned import thin_means, thin_tracks
 
 
-def geojson_text(answer: Answer, num_hypotheses: int | None) -> Iterator[str]:
+def geojson_text(answer: Answer, num_hypotheses: int) -> Iterator[str]:
     """The document, a feature at a time."""
     yield '{"type":"FeatureCollection","features":[\n'
     mark = ""
@@ -23,7 +23,7 @@ def geojson_text(answer: Answer, num_hypotheses: int | None) -> Iterator[str]:
     yield "\n]}\n"
 
 
-def _features(answer: Answer, num_hypotheses: int | None) -> Iterator[dict[str, Any]]:
+def _features(answer: Answer, num_hypotheses: int) -> Iterator[dict[str, Any]]:
     for region in answer.regions:
         shape = region_in_degrees(answer.frame, region.shape)
         properties = {"agent": region.agent_id, "kind": "region", "level": region.level, "time": iso(region.time_ns)}
@@ -31,8 +31,8 @@ def _features(answer: Answer, num_hypotheses: int | None) -> Iterator[dict[str, 
             properties["window"] = region.window
         geometry = json.loads(shapely.to_geojson(shapely.set_precision(shape, 10.0**-DECIMALS)))
         yield {"type": "Feature", "properties": properties, "geometry": geometry}
-    for track in (*answer.tracks(num_hypotheses), *answer.means()):
-        for piece, place in pieces(answer.frame, thinned(track)):
+    for track in (*thin_tracks(answer, num_hypotheses), *thin_means(answer)):
+        for piece, place in pieces(answer.frame, track):
             yield {"type": "Feature", "properties": _properties(piece), "geometry": _line(place, piece.height_m)}
 
 

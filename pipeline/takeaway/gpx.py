@@ -8,16 +8,15 @@ import numpy as np
 from cadence.arrays import Float64s
 from pipeline.takeaway.answer import Answer, Track
 from pipeline.takeaway.degrees import DECIMALS, HEIGHT_DECIMALS, coordinates, iso
-from pipeline.takeaway.thinned import thinned
+from pipeline.takeaway.thinned import thin_means, thin_tracks
 
 
-def gpx_text(answer: Answer, num_hypotheses: int | None) -> Iterator[str]:
+def gpx_text(answer: Answer, num_hypotheses: int) -> Iterator[str]:
     """The document, a track at a time: means first, as most devices show the first ones."""
     yield '<?xml version="1.0" encoding="UTF-8"?>\n<gpx version="1.1" creator="CADENCE" xmlns="http://www.topografix.com/GPX/1/1">\n'
     yield f"<metadata><name>{escape(answer.name)}</name></metadata>\n"
-    for track in (*answer.means(), *answer.tracks(num_hypotheses)):
-        thin = thinned(track)
-        yield _track(thin, coordinates(answer.frame, thin.position_m))
+    for track in (*thin_means(answer), *thin_tracks(answer, num_hypotheses)):
+        yield _track(track, coordinates(answer.frame, track.position_m))
     yield "</gpx>\n"
 
 

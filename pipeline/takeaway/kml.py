@@ -9,7 +9,7 @@ from cadence.arrays import Float64s
 from pipeline.takeaway.answer import Answer, RegionAt, Track
 from pipeline.takeaway.colors import colors, opacity
 from pipeline.takeaway.degrees import DECIMALS, HEIGHT_DECIMALS, iso, pieces, region_in_degrees, rings
-from pipeline.takeaway.thinned import thinned
+from pipeline.takeaway.thinned import thin_means, thin_tracks
 
 _HEAD = (
     '<?xml version="1.0" encoding="UTF-8"?>\n'
@@ -17,19 +17,19 @@ _HEAD = (
 )
 
 
-def kml_text(answer: Answer, num_hypotheses: int | None) -> Iterator[str]:
+def kml_text(answer: Answer, num_hypotheses: int) -> Iterator[str]:
     """The document, a placemark at a time."""
     hues = colors(answer.agent_ids)
     yield f"{_HEAD}<name>{escape(answer.name)}</name>\n"
     regions = list(answer.regions)
-    tracks = list(answer.tracks(num_hypotheses))
+    tracks = thin_tracks(answer, num_hypotheses)
     heaviest = max((track.weight for track in tracks), default=1.0)
-    means = list(answer.means())
+    means = thin_means(answer)
     for agent_id in answer.agent_ids:
         yield f"<Folder><name>{escape(agent_id)}</name>\n"
         for track in (each for each in (*tracks, *means) if each.agent_id == agent_id):
             alpha = 1.0 if track.hypothesis is None else opacity(track.weight, heaviest)
-            for piece, place in pieces(answer.frame, thinned(track)):
+            for piece, place in pieces(answer.frame, track):
                 yield _track(piece, place, _color(hues[agent_id], alpha), 3 if track.hypothesis is None else 1)
         for region in (each for each in regions if each.agent_id == agent_id):
             yield _region(answer, region, _color(hues[agent_id], 0.4 - 0.3 * region.level))

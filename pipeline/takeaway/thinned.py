@@ -1,11 +1,25 @@
 """Tracks with the steps that matter: what a straight line at even speed gives anyway is left out."""
 
+import functools
+
 import numpy as np
 
 from cadence.arrays import Bools, Float64s, Int64s
-from pipeline.takeaway.answer import Track
+from pipeline.takeaway.answer import Answer, Track
 
 TOLERANCE_M = 0.05
+
+
+@functools.lru_cache(maxsize=1)
+def thin_tracks(answer: Answer, num_hypotheses: int) -> tuple[Track, ...]:
+    """The heaviest hypotheses of a mission, thinned once for all formats."""
+    return tuple(map(thinned, answer.tracks(num_hypotheses)))
+
+
+@functools.lru_cache(maxsize=1)
+def thin_means(answer: Answer) -> tuple[Track, ...]:
+    """The means of a mission, thinned once for all formats."""
+    return tuple(map(thinned, answer.means()))
 
 
 def thinned(track: Track, tolerance_m: float = TOLERANCE_M) -> Track:
