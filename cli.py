@@ -107,6 +107,8 @@ Source = Annotated[
 Drawn = Annotated[
     int | None, typer.Option(metavar="N", help="With --to: hypotheses, the heaviest; default: 30, in GeoParquet all.")
 ]
+Before = Annotated[float | None, typer.Option(metavar="S", help="Begin so long before an agent's first detection.")]
+After = Annotated[float | None, typer.Option(metavar="S", help="End so long after an agent's last detection.")]
 Checkpoint = Annotated[str | None, typer.Option(metavar="NAME", help="Evaluate its forecasts on the logs in MISSION.")]
 ForecastOut = Annotated[Path | None, typer.Option("--out", metavar="DIR", help="For the forecasts' scores; default: MISSION.")]
 
@@ -198,8 +200,8 @@ def run(
 ) -> int:  # fmt: skip
     """Run all stages on every log.
 
-    Ingest, extract, infer, export, report; finished stages are skipped. Folders are searched for logs, parts of a split
-    recording are one mission. Each gets the mission directory DIR/<its name>; what became of all is in DIR/batch.json.
+    Ingest, extract, infer, retrospect, export, report; finished stages are skipped. Folders are searched for logs, parts of a
+    split recording are one mission. Each gets the mission directory DIR/<its name>; what became of all is in DIR/batch.json.
     One bad log does not stop the others; the exit code is the highest of the failures; without any it is 8 where results rest
     on a suspicion, or 7 where only damaged logs are amiss.
     That nothing was detected in a log is no failure, unless nothing was detected in any of them (3).
@@ -292,12 +294,35 @@ def infer(
 
 
 @app.command()
+def retrospect(
+    mission: Mission, before: Before = None, after: After = None, config: Config = None, settings: Set = None,
+    seed: Seed = None, force: Force = False, quiet: Quiet = False, as_json: Json = False,
+) -> None:  # fmt: skip
+    """Stage 4: draw mission hypotheses.
+
+    Whole tracks of all agents from first to last detection, given all detections: the same hypothesis is the same story from
+    beginning to end. Writes mission.parquet.
+
+    \b
+    Examples:
+      cadence retrospect results/flight
+      cadence retrospect results/flight --before 600 --after 600 --set retrospect.num_hypotheses=1000
+    """
+    from pipeline.retrospect.config import RetrospectConfig
+    from pipeline.retrospect.stage import retrospect as stage
+
+    around = [f"retrospect.{name}_s={value}" for name, value in (("before", before), ("after", after)) if value is not None]
+    resolved = stage_config(RetrospectConfig, "retrospect", config, [*(settings or ()), *around], seed)
+    _show(stage(mission, resolved, Progress(quiet), force), as_json)
+
+
+@app.command()
 def export(
     mission: Mission, to: TakeTo = None, out: TakeOut = None, source: Source = None, hypotheses: Drawn = None,
     combined: Combined = False, config: Config = None, settings: Set = None, force: Force = False, quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:  # fmt: skip
-    """Stage 4: write the files for Foxglove, or others.
+    """Stage 5: write the files for Foxglove, or others.
 
     The side file NAME.cadence.mcap, to be opened together with the log, and a layout to import. With --to nothing of that, but
     tracks with their times and weights, means, and regions that hold 50 and 90 %; formats: geoparquet, geojson, kml, czml,
@@ -327,7 +352,7 @@ def report(
     mission: Mission, config: Config = None, settings: Set = None, force: Force = False, quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:  # fmt: skip
-    """Stage 5: write report.html, a page for any browser.
+    """Stage 6: write report.html, a page for any browser.
 
     \b
     Example:

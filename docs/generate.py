@@ -24,8 +24,8 @@ from pipeline.config import TABLES
 from pipeline.mapping.message_types import MESSAGE_TYPES
 
 COMMANDS = (
-    "info", "doctor", "import", "run", "ingest", "extract", "infer", "export", "report", "evaluate", "view",
-    "simulate", "train", "ask",
+    "info", "doctor", "import", "run", "ingest", "extract", "infer", "retrospect", "export", "report", "evaluate",
+    "view", "simulate", "train", "ask",
 )  # fmt: skip
 QUESTIONS = ("where", "inside", "arrive", "passed", "meet", "same", "searched")
 

@@ -25,7 +25,7 @@ _LARGEST_SEED = 2**63 - 1
 
 _PLAIN = {float: "a number", int: "a whole number", str: "a text", bool: "true or false", Path: "a path"}
 
-TABLES = ("ingest", "extract", "infer", "export", "report", "evaluate", "simulate", "train")
+TABLES = ("ingest", "extract", "infer", "retrospect", "export", "report", "evaluate", "simulate", "train")
 """The tables of a configuration file, one a stage. One file may hold all of them; each command reads its own."""
 
 

@@ -21,7 +21,9 @@ from pipeline.provenance import versions
 
 JsonObject = Mapping[str, Any]
 
-CHAIN: Final[Mapping[str, str]] = {"ingest": "the catalogue", "extract": "the detections", "infer": "the hypotheses"}
+CHAIN: Final[Mapping[str, str]] = {
+    "ingest": "the catalogue", "extract": "the detections", "infer": "the hypotheses", "retrospect": "the mission hypotheses",
+}  # fmt: skip
 """The stages whose results later ones read, in their order, and what their results are called."""
 
 

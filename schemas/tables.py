@@ -100,6 +100,19 @@ The last window has a row for every detection so far, also for those before its 
 """
 
 
+PASTS = pa.schema(
+    [
+        pa.field("association", pa.int32(), nullable=False),
+        pa.field("weight", pa.float64(), nullable=False),  # of the association; those of all sum to one
+        pa.field("detection", pa.int64(), nullable=False),  # row of DETECTIONS, from 0
+        pa.field("agent_id", pa.string()),  # null = clutter
+    ]
+)
+"""One row per association hypothesis of the whole stream, as known in the last window, and detection of unknown origin.
+
+Rows of an association are in order of time; the first association agrees most with all.
+"""
+
 MISSION = pa.schema(
     [
         pa.field("log_id", pa.string(), nullable=False),

@@ -209,7 +209,7 @@ def test_a_bad_log_among_good_ones_costs_only_itself(tmp_path, out, capsys):
     assert {path.name for path in out.rglob("report.html")} and (out / "good1" / "good1.cadence.mcap").is_file()
 
 
-@pytest.mark.parametrize("command", ["extract", "infer", "export", "report", "evaluate"])
+@pytest.mark.parametrize("command", ["extract", "infer", "retrospect", "export", "report", "evaluate"])
 def test_stage_without_what_it_needs_says_which_stage_to_run(command, tmp_path, capsys):
     (tmp_path / "mission").mkdir()
     settings = ["--set", "infer.checkpoint=none"] if command == "infer" else []

@@ -16,8 +16,8 @@ from pipeline.progress import Progress
 
 ROOT = Path(__file__).resolve().parents[1]
 COMMANDS = (
-    "info", "doctor", "import", "run", "ingest", "extract", "infer", "export", "report", "evaluate", "view",
-    "simulate", "train", "ask",
+    "info", "doctor", "import", "run", "ingest", "extract", "infer", "retrospect", "export", "report", "evaluate",
+    "view", "simulate", "train", "ask",
 )  # fmt: skip
 
 
@@ -268,7 +268,7 @@ def test_what_is_no_mission_directory_is_said_with_the_way_on(tmp_path, capsys):
         tmp_path: "holds no catalogue.json, so it is no mission directory; `cadence run LOG --out results` makes one",
         tmp_path / "nowhere": "not found; `cadence run LOG --out results` makes one",
     }
-    for command in ("extract", "infer", "export", "report"):
+    for command in ("extract", "infer", "retrospect", "export", "report"):
         for path, words in said.items():
             assert cli.main([command, str(path), "-q"]) == 3
             (line,) = capsys.readouterr().err.splitlines()

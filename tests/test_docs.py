@@ -166,7 +166,15 @@ def test_architecture_names_every_package_and_stage():
 
 def test_formats_page_names_every_column_topic_and_field():
     text = (ROOT / "docs" / "formats.md").read_text(encoding="utf-8")
-    schemas = (tables.DETECTIONS, tables.TRUTH, tables.POSES, tables.WINDOWS, tables.MISSION, tables.hypotheses_schema(1))
+    schemas = (
+        tables.DETECTIONS,
+        tables.TRUTH,
+        tables.POSES,
+        tables.WINDOWS,
+        tables.MISSION,
+        tables.PASTS,
+        tables.hypotheses_schema(1),
+    )
     names = {name for schema in schemas for name in schema.names}
     names |= {value.topic for value in vars(channels).values() if isinstance(value, channels.Channel)}
     for kind in ("Hypotheses", "Agents", "Detection"):

@@ -40,7 +40,7 @@ def log(tmp_path):
 def test_all_results_are_there_and_the_log_is_untouched(log, tmp_path, capsys):
     before = hash_file(log)
     (record,) = run(capsys, log, tmp_path / "out", *BANK)
-    assert [stage["stage"] for stage in record["stages"]] == ["ingest", "extract", "infer", "export", "report"]
+    assert [stage["stage"] for stage in record["stages"]] == ["ingest", "extract", "infer", "retrospect", "export", "report"]
     assert record["error"] is None and {stage["status"] for stage in record["stages"]} == {"done"}
     mission = tmp_path / "out" / "walk"
     assert record["directory"] == str(mission) and all((mission / name).is_file() for name in RESULTS)
@@ -65,7 +65,7 @@ def test_second_run_does_nothing_and_a_changed_setting_redoes_what_depends_on_it
     (again,) = run(capsys, log, tmp_path / "out", *BANK)
     assert {stage["status"] for stage in again["stages"]} == {"skipped"}
     (changed,) = run(capsys, log, tmp_path / "out", *BANK, "--set", "infer.num_hypotheses=6")
-    assert [stage["status"] for stage in changed["stages"]] == ["skipped", "skipped", "done", "done", "done"]
+    assert [stage["status"] for stage in changed["stages"]] == ["skipped", "skipped", "done", "done", "done", "done"]
 
 
 def test_same_seed_same_bytes_other_seed_other_hypotheses(log, tmp_path, capsys):
@@ -82,7 +82,7 @@ def test_stages_one_by_one_give_what_run_gives(log, tmp_path, capsys):
     mission = str(tmp_path / "single" / "walk")
     settings = ["--quiet", *SMALL[:-2], *BANK]
     assert cli.main(["ingest", str(log), "--out", str(tmp_path / "single"), "-q"]) == 0
-    for command in ("extract", "infer", "export", "report"):
+    for command in ("extract", "infer", "retrospect", "export", "report"):
         assert cli.main([command, mission, *settings]) == 0
     for name in RESULTS:
         assert hash_file(Path(mission) / name) == hash_file(tmp_path / "run" / "walk" / name), name

@@ -72,11 +72,16 @@ def filter_forward(models: MotionModels, nodes: Nodes, position_sigma_m: Tensor)
     Returns:
         Moments, transitions (identity into the first node) and the log likelihood of each row's detections.
     """
+    first = nodes.is_observed.to(torch.int64).argmax(dim=1)
+    begin_m = nodes.position_m[torch.arange(len(first)), first]
+    return filter_from(models, nodes, *diffuse_start(models, begin_m, position_sigma_m))
+
+
+def filter_from(models: MotionModels, nodes: Nodes, mean: Tensor, covariance: Tensor) -> Filtered:
+    """`filter_forward` from given moments [P, S(, S)] at the first node, before its detection is seen."""
     num_rows, num_nodes = nodes.time_s.shape
     duration = torch.diff(nodes.time_s, dim=1, prepend=nodes.time_s[:, :1])
     matrix, noise = transition(models, duration)
-    first = nodes.is_observed.to(torch.int64).argmax(dim=1)
-    mean, covariance = _start(models, nodes.position_m[torch.arange(num_rows), first], position_sigma_m)
     log_likelihood = torch.zeros(num_rows, dtype=torch.float64)
     means, covariances = [], []
     for m in range(num_nodes):
@@ -93,8 +98,8 @@ def filter_forward(models: MotionModels, nodes: Nodes, position_sigma_m: Tensor)
     return Filtered(torch.stack(means, 1), torch.stack(covariances, 1), matrix, noise, log_likelihood)
 
 
-def _start(models: MotionModels, position_m: Tensor, sigma_m: Tensor) -> tuple[Tensor, Tensor]:
-    """A diffuse position, or a diffuse centre and the stationary law about it."""
+def diffuse_start(models: MotionModels, position_m: Tensor, sigma_m: Tensor) -> tuple[Tensor, Tensor]:
+    """A diffuse position [P] about [P, 2], or a diffuse centre and the stationary law about it: moments [P, S(, S)]."""
     size = models.num_states
     mean = position_m.repeat(1, size // 2)
     mean[:, 2:4] = 0.0

@@ -39,7 +39,7 @@ class KeepOut:
 
 
 def within_limits(
-    position_m: Tensor, keep_out: KeepOut, is_pinned: Tensor, longest_m: float | None, is_held: Tensor
+    position_m: Tensor, keep_out: KeepOut, is_pinned: Tensor, longest_m: float | Tensor | None, is_held: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Tracks [R, K, T, 2] slowed down, brought onto the map and led around obstacles, in turns as often as helps.
 
@@ -47,7 +47,7 @@ def within_limits(
         position_m: the tracks.
         keep_out: where they may not be.
         is_pinned: [R, K, T] steps that a way round an obstacle leaves exactly where they are.
-        longest_m: how long a step may be, or None.
+        longest_m: how long a step may be, each [T - 1] or all, or None.
         is_held: [R, K, T] steps that stay where they are when a track is slowed down; at least one a track.
 
     Returns:

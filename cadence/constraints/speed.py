@@ -7,8 +7,8 @@ _ROUNDS = 60
 _SLACK = 1e-9
 
 
-def exceeds(position_m: Tensor, longest_m: float) -> Tensor:
-    """Whether a step of the tracks [..., T, 2] is longer than `longest_m` [...]; a rounding error is not."""
+def exceeds(position_m: Tensor, longest_m: float | Tensor) -> Tensor:
+    """Whether a step of the tracks [..., T, 2] is longer than `longest_m`, of all or each [T - 1]; a rounding error is not."""
     is_long: Tensor = position_m.diff(dim=-2).norm(dim=-1) > longest_m * (1.0 + 1e-6)
     return is_long.any(dim=-1)
 
@@ -36,7 +36,7 @@ def needed_speed(time_s: Tensor, position_m: Tensor, sigma_m: Tensor, is_observe
     return fastest, torch.where(fastest > 0.0, gap_s.gather(1, pair[:, None])[:, 0], 0.0)
 
 
-def limit_steps(position_m: Tensor, is_pinned: Tensor, longest_m: float) -> tuple[Tensor, Tensor]:
+def limit_steps(position_m: Tensor, is_pinned: Tensor, longest_m: float | Tensor) -> tuple[Tensor, Tensor]:
     """Tracks whose steps are at most so long, and which of them could be had.
 
     Between two pinned steps it is the projection onto the tracks that keep both ends and the limit (Dykstra's alternating
@@ -46,7 +46,7 @@ def limit_steps(position_m: Tensor, is_pinned: Tensor, longest_m: float) -> tupl
     Args:
         position_m: [N, T, 2] metres, float64.
         is_pinned: [N, T] bool, steps that stay exactly where they are; at least one a track.
-        longest_m: the limit.
+        longest_m: the limit of all steps, or of each one [T - 1].
 
     Returns:
         Tracks [N, T, 2], those that kept the limit unchanged, and whether they keep it now [N]: two pinned steps may be further
@@ -59,9 +59,9 @@ def limit_steps(position_m: Tensor, is_pinned: Tensor, longest_m: float) -> tupl
     return moved, ~exceeds(moved, longest_m)
 
 
-def _limited(position_m: Tensor, is_pinned: Tensor, longest_m: float) -> Tensor:
+def _limited(position_m: Tensor, is_pinned: Tensor, longest_m: float | Tensor) -> Tensor:
     step_m = position_m.diff(dim=1)
-    legs = _Legs(is_pinned, step_m)
+    legs = _Legs(is_pinned, step_m, longest_m)
     found, correction = step_m, torch.zeros_like(step_m)
     for _ in range(_ROUNDS):
         short = _shortened(found + correction, longest_m)
@@ -75,16 +75,17 @@ def _limited(position_m: Tensor, is_pinned: Tensor, longest_m: float) -> Tensor:
     return torch.where(is_pinned[..., None], position_m, track)
 
 
-def _shortened(step_m: Tensor, longest_m: float) -> Tensor:
+def _shortened(step_m: Tensor, longest_m: float | Tensor) -> Tensor:
     length = step_m.norm(dim=-1, keepdim=True)
-    shortened: Tensor = step_m * (longest_m / length.clamp_min(longest_m))
+    limit = longest_m[:, None] if isinstance(longest_m, Tensor) else longest_m
+    shortened: Tensor = step_m * (limit / length.clamp_min(limit))
     return shortened
 
 
 class _Legs:
     """The stretches between pinned steps of N tracks: a number for each of the T - 1 steps, and what they must add up to."""
 
-    def __init__(self, is_pinned: Tensor, step_m: Tensor) -> None:
+    def __init__(self, is_pinned: Tensor, step_m: Tensor, longest_m: float | Tensor) -> None:
         number = is_pinned.cumsum(dim=1)
         self.leg = number[:, :-1]
         self.is_closed = (self.leg > 0) & (self.leg < number[:, -1:])
@@ -93,6 +94,10 @@ class _Legs:
         count.scatter_add_(1, self.leg, torch.ones_like(self.leg, dtype=step_m.dtype))
         self.count = count.gather(1, self.leg)[..., None]
         self.mean_m = self._mean(step_m)
+        self.straight_m = self.mean_m
+        if isinstance(longest_m, Tensor):  # the straight way is walked at one speed, not in even steps
+            share = longest_m.expand(step_m.shape[:2])[..., None].expand(-1, -1, 2)
+            self.straight_m = self.mean_m * share / self._mean(share)
 
     def _mean(self, step_m: Tensor) -> Tensor:
         """Mean step of each step's leg [N, T - 1, 2]."""
@@ -104,12 +109,12 @@ class _Legs:
         """The nearest steps that lead from each pinned step to the next."""
         return torch.where(self.is_closed[..., None], step_m + self.mean_m - self._mean(step_m), step_m)
 
-    def drawn_straight(self, step_m: Tensor, longest_m: float) -> Tensor:
-        """The steps drawn towards their leg's mean step as far as none is too long; as they are where that cannot help."""
-        away = step_m - self.mean_m
-        along, square = (self.mean_m * away).sum(-1), away.square().sum(-1).clamp_min(1e-300)
-        room = longest_m**2 - self.mean_m.square().sum(-1)
+    def drawn_straight(self, step_m: Tensor, longest_m: float | Tensor) -> Tensor:
+        """The steps drawn towards their leg's straight way as far as none is too long; as they are where that cannot help."""
+        away = step_m - self.straight_m
+        along, square = (self.straight_m * away).sum(-1), away.square().sum(-1).clamp_min(1e-300)
+        room = longest_m**2 - self.straight_m.square().sum(-1)
         share = ((along.square() + square * room).clamp_min(0.0).sqrt() - along) / square
         least = torch.ones(len(step_m), self.num_legs, dtype=step_m.dtype)
         least.scatter_reduce_(1, self.leg, share.clamp(0.0, 1.0), "amin")
-        return torch.where(room[..., None] >= 0.0, self.mean_m + least.gather(1, self.leg)[..., None] * away, step_m)
+        return torch.where(room[..., None] >= 0.0, self.straight_m + least.gather(1, self.leg)[..., None] * away, step_m)

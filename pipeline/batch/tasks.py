@@ -24,9 +24,10 @@ from pipeline.missions import find_missions
 from pipeline.out_of_memory import ADVICE, is_out_of_memory
 from pipeline.progress import Progress, Told
 from pipeline.report.stage import report
+from pipeline.retrospect.stage import retrospect
 
-STAGES = ("ingest", "extract", "infer", "export", "report")
-_PROGRESS = (0.0, 0.05, 0.1, 0.85, 0.95, 1.0)
+STAGES = ("ingest", "extract", "infer", "retrospect", "export", "report")
+_PROGRESS = (0.0, 0.05, 0.1, 0.7, 0.85, 0.95, 1.0)
 """How much of a mission is done before and after each: most of the time goes into infer."""
 
 
@@ -54,7 +55,7 @@ def plan_tasks(logs: Sequence[str], out: str, config: RunConfig, force: bool = F
 
 
 def run_task(task: LogTask, progress: Progress) -> LogOutcome:
-    """Ingest, extract, infer, export and report one mission. Failures are in the outcome, also defects."""
+    """Ingest, extract, infer, retrospect, export and report one mission. Failures are in the outcome, also defects."""
     started_s = time.monotonic()
     finished: list[StageResult] = []
     message, code, trace = "", 0, ""
@@ -110,6 +111,10 @@ def _infer(task: LogTask, progress: Progress) -> StageResult:
     return infer(Path(task.directory), task.config.infer, progress, task.force, task.num_threads)
 
 
+def _retrospect(task: LogTask, progress: Progress) -> StageResult:
+    return retrospect(Path(task.directory), task.config.retrospect, progress, task.force, task.num_threads)
+
+
 def _export(task: LogTask, progress: Progress) -> StageResult:
     return export(Path(task.directory), task.config.export, progress, task.force)
 
@@ -118,4 +123,6 @@ def _report(task: LogTask, progress: Progress) -> StageResult:
     return report(Path(task.directory), task.config.report, progress, task.force)
 
 
-_RUNS: tuple[Callable[[LogTask, Progress], StageResult], ...] = (_ingest, _extract, _infer, _export, _report)
+_RUNS: tuple[Callable[[LogTask, Progress], StageResult], ...] = (
+    _ingest, _extract, _infer, _retrospect, _export, _report,
+)  # fmt: skip

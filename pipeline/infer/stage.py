@@ -22,7 +22,7 @@ def infer(
 ) -> StageResult:
     """Draw hypotheses for every window of the mission in `directory`: hypotheses.parquet and windows.parquet.
 
-    Where detections of unknown origin were told apart, associations.parquet and labels.parquet hold how. A checkpoint that the
+    Where detections of unknown origin were told apart, associations, labels and pasts.parquet hold how. A checkpoint that the
     log shows not to fit is not used but suspected; `ImplausibleInputError` where `config.is_strict`. Windows are drawn in
     `num_threads` threads, by default one a core; their number changes no byte.
     """

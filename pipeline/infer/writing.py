@@ -16,6 +16,7 @@ from pipeline.infer.draws import Drawn
 from pipeline.infer.plan import Beside, Plan
 from pipeline.infer.rows import hypothesis_rows, window_rows, with_association, with_effective
 from pipeline.obstacle_file import OBSTACLES_NAME, read_obstacles
+from pipeline.pasts import write_pasts
 from pipeline.progress import Progress
 from pipeline.tables import Frame, read_table, write_table
 from pipeline.threads import in_order, num_cores, one_thread
@@ -51,6 +52,7 @@ def write_tables(
         write_table(found, folder / "associations.parquet", "associations", frame)
         labels = plan.seen.sources.association.labels(plan.seen.sources.grid)
         write_table(labels, folder / "labels.parquet", "labels", frame)
+        write_pasts(plan.seen.sources.association, folder, frame)
     return {
         **summary,
         "step_s": plan.seen.sources.grid.step_s,

@@ -5,7 +5,7 @@ from pathlib import Path
 from pipeline.missions import CATALOGUE_NAME, no_mission
 from pipeline.obstacle_file import OBSTACLES_NAME
 
-STAGES = ("ingest", "extract", "infer", "export", "evaluate")
+STAGES = ("ingest", "extract", "infer", "retrospect", "export", "evaluate")
 """Stages whose manifests the page shows, in the order of the work."""
 
 

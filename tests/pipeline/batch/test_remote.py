@@ -20,7 +20,7 @@ from pipeline.stores.objects import list_folder, read_bytes, remove, write_file
 
 pytest_plugins = ("fixtures.s3",)
 QUIET = Progress(quiet=True)
-STAGES = ("ingest", "extract", "infer", "export", "report")
+STAGES = ("ingest", "extract", "infer", "retrospect", "export", "report")
 
 
 def config(*more):
@@ -91,7 +91,7 @@ def test_what_is_done_is_neither_fetched_nor_computed_again(s3, logs, monkeypatc
     assert s3.count("GET", "near.mcap") == 0 and s3.count("PUT", "/near/") == 0
     # A setting of the last stages: what it does not concern is taken over from the bucket.
     (changed,) = remote_run("s3://sea/logs/near.mcap", settings=["export.max_vertices=8"])
-    assert [stage.status for stage in changed.stages] == ["skipped"] * 3 + ["done"] * 2
+    assert [stage.status for stage in changed.stages] == ["skipped"] * 4 + ["done"] * 2
     after = contents("s3://sea/out/near")
     assert {name for name in after if after[name] != before[name]} >= {"near.cadence.mcap", "export.manifest.json"}
     assert s3.count("PUT", "hypotheses.parquet") == 0 and set(after) == set(before)
@@ -176,7 +176,7 @@ def test_manifests_come_last_and_the_receipt_last_of_all(s3, logs):
     remote_run("s3://sea/logs/near.mcap")
     written = [path.rpartition("/")[2] for method, path in s3.requests if method == "PUT" and "/near/" in path]
     is_manifest = [name.endswith(".manifest.json") for name in written]
-    assert is_manifest == sorted(is_manifest) and written[-1] == RECEIPT_NAME and sum(is_manifest) == 6
+    assert is_manifest == sorted(is_manifest) and written[-1] == RECEIPT_NAME and sum(is_manifest) == 7
 
 
 def test_a_broken_connection_while_publishing_leaves_nothing_that_looks_done(s3, logs, monkeypatch):
@@ -227,7 +227,7 @@ def test_from_bucket_to_disk(s3, logs, tmp_path, monkeypatch):
         assert remote_run("s3://sea/logs/near.mcap", out=str(tmp_path / "out"))[0].status == "skipped"
     (mission / "report.html").unlink()
     (outcome,) = remote_run("s3://sea/logs/near.mcap", out=str(tmp_path / "out"))
-    assert [stage.status for stage in outcome.stages] == ["skipped"] * 4 + ["done"]
+    assert [stage.status for stage in outcome.stages] == ["skipped"] * 5 + ["done"]
 
 
 def test_from_disk_to_bucket(s3, logs):

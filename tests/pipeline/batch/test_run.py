@@ -18,7 +18,7 @@ from pipeline.missions import mission_directories
 from pipeline.progress import Progress
 
 QUIET = Progress(quiet=True)
-STAGES = ("ingest", "extract", "infer", "export", "report")
+STAGES = ("ingest", "extract", "infer", "retrospect", "export", "report")
 
 
 @pytest.fixture
@@ -69,7 +69,7 @@ def test_every_log_goes_through_every_stage_in_order(calls, tmp_path):
 def test_a_bad_log_does_not_stop_the_others(calls, tmp_path, capsys):
     calls.failing = {("extract", "b"): InputError("b.mcap: no detections"), ("export", "c"): DeviceError("disk full")}
     outcomes = run_here("abcd", tmp_path)
-    assert [len(outcome.stages) for outcome in outcomes] == [5, 1, 3, 5]
+    assert [len(outcome.stages) for outcome in outcomes] == [6, 1, 4, 6]
     assert [outcome.message for outcome in outcomes] == ["", "b.mcap: no detections", "c.mcap: disk full", ""]
     assert exit_code(outcomes) == 5
     assert capsys.readouterr() == ("", "")

@@ -1,0 +1,1 @@
+"""Retrospect: one answer for the mission as a whole, given all that was detected."""
