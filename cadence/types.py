@@ -99,10 +99,10 @@ class Evidence(Protocol):
         """Of which of the steps at `time_s` [B, T] it speaks [B, T]; windows without any are left as they are drawn."""
         ...
 
-    def least_credible(self, time_s: Tensor) -> Tensor:
-        """Log likelihood [B] that at least one of many tracks over `time_s` [B, T] should reach.
+    def contradicts(self, tracks: Tracks, log_likelihood: Tensor) -> Tensor:
+        """Where it speaks against all of the tracks together: [B, A], or [B] for all agents alike; `log_likelihood` is its own.
 
-        Where no track does, the evidence contradicts what is drawn; it is told and not believed.
+        There it is told and not believed. Weights cannot tell: they are the same whether tracks fit well or all of them badly.
         """
         ...
 

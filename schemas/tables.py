@@ -51,6 +51,21 @@ POSES = pa.schema(
     ]
 )
 
+LOOKS = pa.schema(
+    [
+        pa.field("log_id", pa.string(), nullable=False),
+        pa.field("time_ns", pa.int64(), nullable=False),
+        pa.field("sensor_id", pa.string(), nullable=False),
+        pa.field("footprint", pa.int32(), nullable=False),  # number of an entry of sensors.json, from 0
+        pa.field("part", pa.int32(), nullable=False),  # which of its curves holds
+        pa.field("x_m", pa.float64(), nullable=False),
+        pa.field("y_m", pa.float64(), nullable=False),
+        pa.field("heading_rad", pa.float64(), nullable=False),  # from east to north; 0 where it faces nowhere
+        pa.field("seen", pa.list_(pa.string()), nullable=False),  # agents that this look detected; a null: nobody knows whom
+    ]
+)
+"""One row per look of a sensor whose footprint is stated, whether it detected anybody or not."""
+
 WINDOWS = pa.schema(
     [
         pa.field("window", pa.int32(), nullable=False),

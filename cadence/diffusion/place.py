@@ -18,7 +18,7 @@ from cadence.constraints.speed import exceeds
 from cadence.diffusion.feasible import redrawn
 from cadence.diffusion.guidance import PaperCost, adam_guidance, clean_estimate_guidance
 from cadence.diffusion.noise import RowNoise
-from cadence.diffusion.place_frame import PlaceConfig, future_of, place_inputs, to_pieces, to_track
+from cadence.diffusion.place_frame import PlaceConfig, future_of, past_of, place_inputs, to_pieces, to_track
 from cadence.diffusion.place_team import agent_rows, shared_detections
 from cadence.diffusion.sampler import even_angles, even_log_snr, sample_ddim, sample_ddpm, sample_dpmpp_2m
 from cadence.diffusion.settings import PlaceSampling
@@ -63,7 +63,11 @@ class PlaceModel:
 
     @torch.no_grad()
     def sample(self, windows: WindowBatch, num_hypotheses: int) -> HypothesisSet:
-        """Hypotheses [B, K, A, T, 2]; a window's depend on its seed, not on its neighbours. `ConfigError` for other grids."""
+        """Hypotheses [B, K, A, T, 2]; a window's depend on its seed, not on its neighbours. `ConfigError` for other grids.
+
+        Grids may begin before now: from the last detection on tracks are drawn there, too (as they were before any obstacle was
+        led around), and before it they are NaN.
+        """
         self._check(windows)
         if self.config.shared_gap_steps:
             windows = shared_detections(windows)
@@ -71,7 +75,7 @@ class PlaceModel:
         network = FrozenPlace(self.network, getattr(torch, self.sampling.precision))
         size = rows.team.num_agents if rows.team is not None else 1  # rows that belong together
         per_chunk = size * max(1, self.sampling.chunk // (num_hypotheses * size))
-        parts = [torch.zeros(0, num_hypotheses, NUM_STEPS, 2, dtype=torch.float64)]
+        parts = [torch.zeros(0, num_hypotheses, windows.num_steps, 2, dtype=torch.float64)]
         for begin in range(0, rows.windows.num_windows, per_chunk):
             part = slice(begin, begin + per_chunk)
             team = rows.team and rows.team[slice(begin // size, (begin + per_chunk) // size)]
@@ -80,7 +84,7 @@ class PlaceModel:
 
     def _check(self, windows: WindowBatch) -> None:
         step_s = self.config.step_s
-        if windows.origin_index or windows.num_steps != NUM_STEPS or abs(windows.step_s / step_s - 1.0) > 1e-6:
+        if windows.num_steps - windows.origin_index != NUM_STEPS or abs(windows.step_s / step_s - 1.0) > 1e-6:
             raise ConfigError(
                 f"infer.grid: this checkpoint predicts {NUM_STEPS} steps of {step_s:g} s from now on; set step_s = {step_s:g}, "
                 f"history_steps = 1, horizon_steps = {NUM_STEPS - 1}"
@@ -118,11 +122,14 @@ class PlaceModel:
         start = stream.draw_pairs(num_hypotheses, shape) if is_paired else stream.draw((num_hypotheses, *shape))
         sampled = self._solved(denoise, start, stream, tracks)
         sampled = tracks.guided(tracks.limited(sampled), "final")
-        positions = future_of(to_track(sampled.double(), inputs.pieces, self.config), self.config)
-        positions = positions + last_m[:, None, None]
+        track = to_track(sampled.double(), inputs.pieces, self.config)
+        positions = future_of(track, self.config) + last_m[:, None, None]
         keep_out = self._keep_out(context, last_m)
         if (context.obstacles.count or keep_out.edge_m) and self.sampling.is_repaired:
             positions = self._repaired(positions, keep_out, inputs.pieces, None if team is not None else windows.seeds)
+        if windows.origin_index:
+            before = past_of(track, inputs.pieces, self.config, windows.origin_index) + last_m[:, None, None]
+            positions = torch.cat([before, positions], dim=2)
         return positions
 
     def _keep_out(self, context: Context, last_m: Tensor) -> KeepOut:

@@ -232,6 +232,17 @@ def future_of(track: Tensor, config: PlaceConfig) -> Tensor:
     return ends[..., before, :] * (1.0 - share) + ends[..., (before + 1).clamp(max=config.num_future), :] * share
 
 
+def past_of(track: Tensor, pieces: Pieces, config: PlaceConfig, num_steps: int) -> Tensor:
+    """Positions [R, K, num_steps, 2] at the steps before now, of tracks [R, K, P + 1, 2]; NaN before the last detection."""
+    at = torch.arange(-num_steps, 0, dtype=track.dtype) - pieces.start[:, :1].to(track.dtype)  # [R, steps] since the detection
+    share = at / pieces.duration[:, :1].to(track.dtype).clamp_min(1e-9)
+    before = share.floor().long().clamp(0, config.num_gap - 1)
+    pick = before[:, None, :, None].expand(-1, track.shape[1], -1, 2)
+    near, far = track.gather(2, pick), track.gather(2, pick + 1)
+    found = near + (share - before)[:, None, :, None] * (far - near)
+    return torch.where((at >= 0)[:, None, :, None], found, torch.nan)
+
+
 def _over(span: Tensor, like: Tensor) -> Tensor:
     """Spans [R, P] to stand beside [R, ..., P, 2]."""
     return span.reshape(len(span), *(1,) * (like.ndim - 3), span.shape[-1], 1).to(like.dtype)

@@ -56,7 +56,7 @@ def _rows(windows: WindowBatch, window: Tensor, agent: Tensor, source: Tensor, i
     goal = context.known_goal_m
     mine = dataclasses.replace(context[window], known_goal_m=None if goal is None else goal[window, source][:, None])
     detections = Detections(*(value[window, source][:, None] for value in columns))
-    rows = WindowBatch(windows.time_s, detections, seeds, 0, mine)
+    rows = WindowBatch(windows.time_s, detections, seeds, windows.origin_index, mine)
     return AgentRows(rows, window, agent, is_real, team)
 
 

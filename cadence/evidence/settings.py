@@ -9,13 +9,17 @@ class WeighingConfig:
 
     is_used    false: evidence is left out
     most_draws where fewer than half of the hypotheses of a window count, so many times as many are drawn to choose from
+    exponent   of silence, 0 (it says nothing) to 1 (looks are independent); by default chosen where withheld detections tell
     is_equal   hypotheses are drawn again by their weights, so that all count the same and some are there several times
     """
 
     is_used: bool = True
     most_draws: int = 8
+    exponent: float | None = None
     is_equal: bool = False
 
     def __post_init__(self) -> None:
+        if self.exponent is not None and not 0 <= self.exponent <= 1:
+            raise ValueError(f"exponent must lie between 0 and 1, got {self.exponent}")
         if self.most_draws < 1:
             raise ValueError(f"most_draws must be at least 1, got {self.most_draws}")

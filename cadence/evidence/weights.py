@@ -54,15 +54,13 @@ def hear(windows: WindowBatch, position_m: Tensor) -> Said:
         if not bool(speaks.any()):
             continue
         is_touched |= speaks
-        value, least = _asked(evidence, tracks), evidence.least_credible(tracks.time_s)
+        value = _asked(evidence, tracks)
+        is_odd = evidence.contradicts(tracks, value).reshape(b, -1).expand(b, a)
         if value.ndim == 2:
-            is_odd = value.amax(1) < least
-            joint += torch.where(is_odd[:, None], 0.0, value)
-            is_contradicted |= is_odd[:, None]
+            joint += torch.where(is_odd.any(1, keepdim=True), 0.0, value)
         else:
-            is_odd_agent = value.amax(1) < least[:, None]
-            apart += torch.where(is_odd_agent[:, None], 0.0, value)
-            is_contradicted |= is_odd_agent
+            apart += torch.where(is_odd[:, None], 0.0, value)
+        is_contradicted |= is_odd
     is_hopeless = (joint + apart.sum(-1)).amax(1) == -torch.inf  # each track ruled out by something else
     joint[is_hopeless], apart[is_hopeless] = 0.0, 0.0
     return Said(joint, apart, is_touched, (is_contradicted | is_hopeless[:, None]) & windows.is_active)

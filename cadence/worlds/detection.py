@@ -10,7 +10,9 @@ import numpy as np
 
 from cadence.arrays import Bools, Float64s
 from cadence.worlds.draws import Draws
+from cadence.worlds.episode import SensorLaw
 
+_NUM_POINTS = 31
 REACH = 3.0
 """Ranges R at which the probability has fallen to zero."""
 
@@ -21,6 +23,13 @@ def detection_probability(distance: Float64s, sure_range: Float64s) -> Float64s:
     ratio = np.divide(distance, sure_range, out=np.full(distance.shape, np.inf), where=sure_range > 0)
     probability: Float64s = np.clip((REACH - ratio) / (REACH - 1.0), 0.0, 1.0)
     return probability
+
+
+def mean_law(sure_range_m: Float64s) -> SensorLaw:
+    """P(detect) over metres of a sensor whose range was `sure_range_m` [N] in turn: their mean."""
+    distance_m = np.linspace(0.0, max(REACH * float(sure_range_m.max(initial=0.0)), 1e-3), _NUM_POINTS)
+    probability = detection_probability(distance_m[:, None], sure_range_m).mean(axis=1)
+    return SensorLaw(distance_m, np.round(probability, 4))
 
 
 def detect(draws: Draws, stream: int, step: int, sensors: Float64s, target: Float64s, sure_range: Float64s) -> Bools:

@@ -30,6 +30,19 @@ class SensorReports:
 
 
 @dataclass(frozen=True, eq=False)
+class SensorLaw:
+    """How surely a sensor detects a target that moves as targets here do, in one step.
+
+    distance_m, probability  [M] straight between these points, nothing beyond the last
+    is_hidden  land hides targets from it
+    """
+
+    distance_m: Float64s
+    probability: Float64s
+    is_hidden: bool = False
+
+
+@dataclass(frozen=True, eq=False)
 class Episode:
     """One mission in a world. Frame: x east, y north, metres; the origin is the terrain's.
 
@@ -39,6 +52,7 @@ class Episode:
     sensors_m [S, T, 2] positions of the sensors
     is_active [S, T] whether a sensor was looking
     goals_m   per agent [G, 2] the places it went for, in order
+    laws      of every sensor, P(detect) over distance; none where a world does not say
     """
 
     world: str
@@ -53,6 +67,7 @@ class Episode:
     is_active: Bools
     detections: SensorReports
     terrain: Terrain
+    laws: tuple[SensorLaw, ...] = ()
 
     def __post_init__(self) -> None:
         agents, sensors, steps = len(self.agent_ids), len(self.sensor_ids), len(self.time_s)
@@ -62,6 +77,8 @@ class Episode:
             "sensors_m": (sensors, steps, 2),
             "is_active": (sensors, steps),
         }
+        if self.laws and len(self.laws) != sensors:
+            raise ValueError(f"Episode: {len(self.laws)} laws of {sensors} sensors")
         for name, want in expected.items():
             if getattr(self, name).shape != want:
                 raise ValueError(f"Episode.{name} has shape {getattr(self, name).shape}, expected {want}")

@@ -25,9 +25,9 @@ import shapely
 
 from cadence.arrays import Bools, Float32s, Float64s, Int64s
 from cadence.recordings import Recordings
-from cadence.worlds.detection import detect
+from cadence.worlds.detection import detect, mean_law
 from cadence.worlds.draws import Draws
-from cadence.worlds.episode import Episode, SensorReports
+from cadence.worlds.episode import Episode, SensorLaw, SensorReports
 from cadence.worlds.ocean import CELL, SIZE, Ocean, eastern_pacific
 from cadence.worlds.pursuit import AIRPLANE, VESSEL, MoverKind, Pursuit, is_working
 from cadence.worlds.terrain import Terrain
@@ -216,7 +216,16 @@ def simulate_narco(config: NarcoConfig, seed: int, index: int) -> Episode:
             step, np.zeros(len(step), dtype=np.int64), sensor, truth[step], np.tile(_SIGMA_M**2 * np.eye(2), (len(step), 1, 1))
         ),
         terrain=land_of(eastern_pacific()),
+        laws=_laws(config, batch.movers[:count, 0].astype(np.float64), float(routes.speed[route, 1:count].mean())),
     )
+
+
+def _laws(config: NarcoConfig, movers: Float64s, speed: float) -> tuple[SensorLaw, ...]:
+    """What each mover [T, M, 2] detects of a target at this speed, from the coverage where it was in turn."""
+    ocean = eastern_pacific()
+    covered = np.stack([ocean.coverage(movers[step], step) for step in range(len(movers))])
+    strength = config.detection_factor * speed * UNIT_M
+    return tuple(mean_law(strength * kind.sensitivity * covered[:, number]) for number, kind in enumerate(config.kinds))
 
 
 def land_of(ocean: Ocean) -> Terrain:

@@ -23,10 +23,11 @@ from cadence.worlds.crews import (
     steer_boat,
     steer_smuggler,
 )
-from cadence.worlds.episode import Episode, SensorReports
+from cadence.worlds.episode import Episode, SensorLaw, SensorReports
 from cadence.worlds.sensors import SensorKind, Sortie, draw_noise, measurement_covariance, sweep_track, swerling_probability
 from cadence.worlds.terrain import Terrain, blocks_segment, random_archipelago
 
+_NUM_POINTS = 26
 # Mean share of steps with a detection by the factor on all detection ranges; 120 episodes of the defaults each.
 _RANGE_FACTORS = (0.5, 0.7, 0.85, 1.0, 1.2, 1.5, 2.0, 3.0)
 _RATES = (0.027, 0.047, 0.076, 0.103, 0.139, 0.187, 0.263, 0.406)
@@ -111,6 +112,15 @@ class _Eyes:
         self.needs_sight = np.array([kind.needs_sight for kind in kinds]) & line_of_sight
         self.land = sea.land
 
+    def laws(self) -> tuple[SensorLaw, ...]:
+        """What each sensor detects of a boat at cruising speed, a scan a step."""
+        found = []
+        for range_m, share, is_hidden in zip(self.range_m, self.scan_share, self.needs_sight, strict=True):
+            distance_m = np.linspace(0.0, 2.5 * range_m, _NUM_POINTS)
+            probability = np.round(share * swerling_probability(distance_m, range_m), 4)
+            found.append(SensorLaw(distance_m, probability, bool(is_hidden)))
+        return tuple(found)
+
     def look(
         self, targets_m: Float64s, speed_mps: Float64s, sensors_m: Float64s, is_active: Bools, rng: np.random.Generator
     ) -> tuple[Int64s, Int64s, Float64s, Float64s]:
@@ -183,6 +193,7 @@ def simulate_patrol(config: PatrolConfig, rng: np.random.Generator) -> Episode:
         is_active=is_active,
         detections=log.close(),
         terrain=terrain,
+        laws=eyes.laws(),
     )
 
 

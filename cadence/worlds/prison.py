@@ -23,10 +23,10 @@ from numpy.typing import NDArray
 
 from cadence.arrays import Bools, Float64s, Int64s
 from cadence.recordings import Recordings
-from cadence.worlds.detection import detect
+from cadence.worlds.detection import detect, mean_law
 from cadence.worlds.draws import Draws
-from cadence.worlds.episode import Episode, SensorReports
-from cadence.worlds.prison_fugitive import MODE_NAMES, Fugitives, Sight, distance_between, stride
+from cadence.worlds.episode import Episode, SensorLaw, SensorReports
+from cadence.worlds.prison_fugitive import MAX_SPEED, MODE_NAMES, Fugitives, Sight, distance_between, stride
 from cadence.worlds.prison_map import (
     CELL_M,
     HIDDEN_CAMERAS,
@@ -256,4 +256,13 @@ def _episode(config: PrisonConfig, batch: _Batch, row: int) -> Episode:
             step, np.zeros(len(step), dtype=np.int64), sensor, truth[step], np.tile(_SIGMA_M**2 * np.eye(2), (len(step), 1, 1))
         ),
         terrain=Terrain(SIDE * CELL_M, np.array([[*MOUNTAIN, KEEP_OUT]]) * CELL_M, ()),
+        laws=_laws(config, sensors / CELL_M, len(camera)),
     )
+
+
+def _laws(config: PrisonConfig, sensors: Float64s, num_cameras: int) -> tuple[SensorLaw, ...]:
+    """What each sensor [S, T, 2], in cells, detects of a fugitive that walks, from the coverage where it stands in turn."""
+    sensitivity = [_CAMERA_K] * num_cameras + [kind.sensitivity for kind in config.kinds]
+    strength = config.detection_factor * MAX_SPEED * CELL_M
+    covered = _at(prison_map().coverage, sensors)
+    return tuple(mean_law(strength * k * row) for k, row in zip(sensitivity, covered, strict=True))

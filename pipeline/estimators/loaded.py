@@ -26,6 +26,8 @@ class Loaded:
     grid           the grid that it takes, out of the configured one; `ConfigError` where it takes another one only
     fit            adapts it to a log; None: nothing adapts
     is_apart       it draws every agent by itself, whatever the others of a window do
+    knows_standing it was trained where sensors stood that stand in its place for ever, so that their silence is in its tracks
+                   already; only that of moving ones may count
     num_past       so many steps before the first one of its grid it can draw as well, for evidence to be heard there
     """
 
@@ -35,6 +37,7 @@ class Loaded:
     fit: Callable[[FittingData], Fitted] | None = None
     is_apart: bool = False
     num_past: int = 0
+    knows_standing: bool = False
 
     def fitted(self, data: FittingData) -> Fitted:
         """The estimator for one log."""

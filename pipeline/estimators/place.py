@@ -16,12 +16,16 @@ from pipeline.weights import load_network
 
 _CONTEXT_STEPS = 4320
 """The longest mission of the paper's worlds."""
+_PAST_STEPS = 120
+"""So far back from now silence is heard."""
 
 
 def load_place(weights: Path, samplings: Samplings) -> Loaded:
     """The checkpoint as the stages see it."""
     model = _limited(load_place_model(weights, samplings.place), samplings.guidance)
-    return Loaded("place", model, lambda grid: place_grid(model.config, grid.stride_steps))
+    return Loaded(
+        "place", model, lambda grid: place_grid(model.config, grid.stride_steps), num_past=_PAST_STEPS, knows_standing=True
+    )
 
 
 def load_place_model(weights: Path, sampling: PlaceSampling | None = None) -> PlaceModel:

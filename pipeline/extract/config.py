@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from pipeline.extract.obstacle_config import ObstacleSources
+from pipeline.extract.sensor_config import SensorConfig
 from pipeline.extract.thinning import ThinningConfig
 from pipeline.mapping.sources import SourceConfig
 from pipeline.moments import moment_ns
@@ -34,6 +35,7 @@ class ExtractConfig:
     datum            [latitude, longitude] in degrees of x = y = 0; by default the median of all positions, and unknown for
                      logs in metres
     obstacles        where obstacles come from; by default what the log says
+    sensors          what sensors look at, so that their silence counts; by default what the log says (`cadence.sensors`)
     """
 
     detections: tuple[SourceConfig, ...] = ()
@@ -53,6 +55,7 @@ class ExtractConfig:
     max_speed_mps: float | None = 1000.0
     datum: tuple[float, float] | None = None
     obstacles: ObstacleSources = field(default_factory=ObstacleSources)
+    sensors: tuple[SensorConfig, ...] = ()
     trusted: tuple[LogKind, ...] = ()
     is_strict: bool = False
 

@@ -16,6 +16,8 @@ from pipeline.extract.accuracy import with_accuracy
 from pipeline.extract.channel_reader import ChannelReader
 from pipeline.extract.collapse import Collapsed, collapse
 from pipeline.extract.config import ExtractConfig
+from pipeline.extract.logged_sensors import logged_sensors
+from pipeline.extract.looks import collect_looks
 from pipeline.extract.mission_rows import rows_in_frame
 from pipeline.extract.obstacle_sources import collect_obstacles
 from pipeline.extract.positions import Positions
@@ -25,6 +27,7 @@ from pipeline.extract.summary import summarise, tell
 from pipeline.extract.tables import detection_table, track_table
 from pipeline.extract.transform_messages import LogTransforms
 from pipeline.logs.reader import MissionLog
+from pipeline.looks import write_looks
 from pipeline.moments import moment_ns
 from pipeline.obstacle_file import OBSTACLES_NAME, write_obstacles
 from pipeline.progress import Progress
@@ -53,6 +56,10 @@ def write_tables(log: MissionLog, folder: Path, config: ExtractConfig, progress:
     counts["collapsed"] = len(rows["detections"]) - len(detections.positions) - detections.num_disagreeing
     truth, counts["duplicate_truth"] = _without_repeats(rows["truth"])
     log_id = log.name
+    sensors = config.sensors or (logged_sensors(log) if config.suggest else ())
+    if sensors:
+        looks, footprints = collect_looks(sensors, rows["poses"], accurate, (log.start_ns, log.end_ns), suspicions)
+        write_looks(folder, log_id, looks, footprints, frame)
     write_table(detection_table(log_id, detections), folder / "detections.parquet", "detections", frame)
     if len(truth):
         write_table(track_table(log_id, truth, "agent_id", truth.agent, TRUTH), folder / "truth.parquet", "truth", frame)

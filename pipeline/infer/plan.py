@@ -12,6 +12,7 @@ from cadence.association.types import AssociationConfig
 from cadence.constraints.obstacles import Obstacles
 from cadence.errors import ImplausibleInputError
 from cadence.evidence.estimator import WithEvidence
+from cadence.evidence.silence import Looks
 from cadence.types import Evidence
 from pipeline.associations import AssociatedWindows, Sources, build_associated_windows, tell_sources
 from pipeline.checkpoints import DEFAULT
@@ -21,6 +22,8 @@ from pipeline.estimators.loaded import Loaded
 from pipeline.estimators.presets import load_estimator
 from pipeline.infer.config import InferConfig
 from pipeline.infer.draws import Piece, draw_associations, draw_tracks, draw_windows
+from pipeline.infer.silence import hear_silence
+from pipeline.looks import Footprint
 from pipeline.progress import Progress
 from pipeline.stream_words import stream_words
 from pipeline.suspicions import Suspicions
@@ -29,11 +32,12 @@ from pipeline.windows import MissionWindows, build_windows
 
 @dataclass(frozen=True, eq=False)
 class Beside:
-    """What is known of a mission beside its detections: when it began, its obstacles, what else speaks about tracks."""
+    """What is known of a mission beside its detections: when it began, obstacles, what else speaks, where sensors looked."""
 
     start_ns: int
     obstacles: Obstacles
     evidence: tuple[Evidence, ...] = ()
+    looks: tuple[tuple[Footprint, Looks], ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,12 +89,13 @@ class Plan:
     suspicions: Suspicions
     max_speed_mps: float | None
     has_evidence: bool
+    remarks: tuple[str, ...] = ()
 
     @property
     def found(self) -> list[str]:
         """What a stream without identity turned out to be, in words."""
         words = stream_words(self.about.get("association", {}))
-        return [words] if words else []
+        return [*([words] if words else []), *self.remarks]
 
     @staticmethod
     def of(config: InferConfig, detections: pa.Table, beside: Beside, progress: Progress) -> "Plan":
@@ -107,7 +112,10 @@ class Plan:
                 return replace(plan, suspicions=suspicions, about={**plan.about, "fit_test": asdict(test)})
             about["fit_test"] = None if test is None else asdict(test)
         fitted = loaded.fitted(data)
-        num, evidence = config.num_hypotheses, beside.evidence if config.evidence.is_used else ()
+        knows, start_ns = loaded.knows_standing, beside.start_ns
+        given = beside.looks, beside.obstacles, config.evidence, fitted.estimator
+        silence = hear_silence(*given, seen.named, start_ns, knows)
+        num, evidence = config.num_hypotheses, (*beside.evidence, *silence.evidence) if config.evidence.is_used else ()
         if seen.associated is None:
             weighed = WithEvidence(fitted.estimator, config.evidence, loaded.is_apart, loaded.num_past)
             located = seen.named.located(beside.start_ns, beside.obstacles, evidence)
@@ -116,8 +124,9 @@ class Plan:
             associated = seen.associated.located(beside.start_ns, beside.obstacles, evidence)
             draw = draw_tracks if loaded.is_apart else draw_associations
             draws = draw(fitted.estimator, associated, num, config.evidence)
-        about = {**fitted.about, **about}
-        return Plan(config.checkpoint, seen, draws, about, suspicions, config.guidance.max_speed_mps, bool(evidence))
+        about = {**fitted.about, **about, **silence.about}
+        limit_mps = config.guidance.max_speed_mps
+        return Plan(config.checkpoint, seen, draws, about, suspicions, limit_mps, bool(evidence), silence.remarks)
 
     @property
     def windows(self) -> MissionWindows:

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+from pipeline.look_files import LOOK_FILES
 from pipeline.missions import CATALOGUE_NAME, no_mission
 from pipeline.obstacle_file import OBSTACLES_NAME
 
@@ -19,6 +20,7 @@ def mission_inputs(directory: Path) -> list[Path]:
         "labels.parquet",
         "truth.parquet",
         "poses.parquet",
+        *LOOK_FILES,
         "scores.json",
         "answers.json",
         "events.csv",

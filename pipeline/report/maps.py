@@ -32,6 +32,11 @@ class View:
         shifted = (np.asarray(position_m, dtype=np.float64) - self._centre_m) * self.pixel_per_m
         return np.asarray(shifted * (1, -1) + (MAP_WIDTH / 2, MAP_HEIGHT / 2))
 
+    def metres(self, pixels: Float64s) -> Float64s:
+        """[..., 2] pixels to [..., 2] metres."""
+        shifted = (np.asarray(pixels, dtype=np.float64) - (MAP_WIDTH / 2, MAP_HEIGHT / 2)) * (1, -1)
+        return np.asarray(shifted / self.pixel_per_m + self._centre_m)
+
 
 def moment_map(
     mission: Mission, fan: Fan, strands: Sequence[Strand], truth: Points | None, steps: tuple[int, int], label: str

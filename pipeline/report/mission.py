@@ -17,11 +17,13 @@ import pyarrow as pa
 from cadence.arrays import Float32s, Float64s, Int64s
 from cadence.constraints.obstacles import Obstacles
 from cadence.errors import InputError
+from cadence.evidence.silence import Looks
 from pipeline.ask.events import Event
 from pipeline.ask.told import read_told
 from pipeline.catalogue import Catalogue, read_catalogue, stated_path
 from pipeline.documents import parse_json
 from pipeline.files import hash_file
+from pipeline.looks import Footprint, read_looks
 from pipeline.manifest import read_manifest
 from pipeline.obstacle_file import OBSTACLES_NAME, as_obstacles, read_obstacle_entries
 from pipeline.presence import with_presence
@@ -123,6 +125,7 @@ class Mission:
     origins                   who was found among detections of unknown origin; these are given to their likeliest agent
     answers, events           what export answered to configured questions, and events
     stored, solid             hypotheses and obstacles as other stages see them
+    looks                     of sensors whose footprints are stated, in seconds from start_ns
     """
 
     log: str
@@ -148,6 +151,7 @@ class Mission:
     origins: Origins | None = None
     answers: tuple[JsonDict, ...] = ()
     events: tuple[Event, ...] = ()
+    looks: tuple[tuple[Footprint, Looks], ...] = ()
 
     def called(self, agent: int, rows: Iterable[WindowRow]) -> str:
         """The agent's name with how likely it is there: the largest probability among `rows`, which are its own."""
@@ -249,6 +253,7 @@ def load_mission(directory: Path) -> Mission:
         origins=origins,
         answers=tuple(answers),
         events=tuple(events),
+        looks=read_looks(directory, start_ns),
     )
 
 

@@ -17,6 +17,7 @@ from pipeline.report.origins import origins_section
 from pipeline.report.payload import Payload
 from pipeline.report.provenance import provenance_section
 from pipeline.report.sections import moments_section, trouble_section, uncertainty_section
+from pipeline.report.silence import silence_section
 from pipeline.report.suspicions import suspicions_section
 from pipeline.report.truth import truth_section
 from pipeline.report.verdict import verdict_section
@@ -82,6 +83,7 @@ def write_page(mission: Mission, analysis: Analysis, payload: Payload, moments: 
         _explorer(mission, payload),
         moments_section(mission, analysis, moments),
         origins_section(mission.origins, mission.start_ns, mission.end_ns, presence, mission.num_tracked, _stream(mission)),
+        silence_section(mission),
         uncertainty_section(mission, analysis),
         truth_section(mission, analysis),
         trouble_section(mission),

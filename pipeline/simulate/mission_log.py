@@ -5,7 +5,8 @@ Topics: /truth/AGENT (positions), /sensors/SENSOR/pose (positions) or /trackers 
 agent),
 /scene/obstacles (foxglove.SceneUpdate, protobuf always).
 Metadata records: `mission` (JSON values: how the log came about), `cadence.obstacles` (key `obstacles`: the list of
-obstacles.json, in the mission frame, whose datum stands beside it).
+obstacles.json, in the mission frame, whose datum stands beside it), `cadence.sensors` (key `sensors`: entries of
+[[extract.sensors]], what each sensor detects, so that its silence counts).
 """
 
 import json
@@ -67,6 +68,8 @@ def write_mission(path: Path, episode: Episode, form: MissionForm, mission: Mapp
         writer.start(profile="ros2" if form.encoding == "cdr" else "", library=f"cadence {versions()['cadence']}")
         writer.add_metadata("mission", {key: json.dumps(value, sort_keys=True) for key, value in mission.items()})
         writer.add_metadata("cadence.obstacles", _obstacle_metadata(episode.terrain, form.frame))
+        if episode.laws:
+            writer.add_metadata("cadence.sensors", {"sensors": json.dumps(sensor_entries(episode, form))})
         _write_messages(writer, episode, form)
         writer.finish()  # type: ignore[no-untyped-call]
 
@@ -78,6 +81,35 @@ def _obstacle_metadata(terrain: Terrain, frame: Frame) -> dict[str, str]:
         "obstacles": json.dumps(obstacles_as_json(terrain)),
         **{key: json.dumps(value) for key, value in keys.items() if value is not None},
     }
+
+
+def sensor_entries(episode: Episode, form: MissionForm) -> list[dict[str, Any]]:
+    """The sensors of an episode as entries of [[extract.sensors]]."""
+    step_s = float(episode.time_s[1] - episode.time_s[0])
+    moves = (np.diff(episode.sensors_m, axis=1) != 0).any(axis=(1, 2))
+    is_grouped = form.groups_trackers and not form.is_geodetic
+    number_in_group = np.cumsum(moves) - 1
+    entries = []
+    for sensor, (name, law) in enumerate(zip(episode.sensor_ids, episode.laws, strict=True)):
+        if not law.probability.any():
+            continue
+        points = np.column_stack([np.round(law.distance_m, 1), law.probability]).tolist()
+        entry: dict[str, Any] = {"sensor": name, "probability": points, "every_s": step_s}
+        if is_grouped and moves[sensor]:
+            entry |= {"sensor": f"trackers/{number_in_group[sensor]}", "detects_as": name}
+        elif is_grouped:
+            entry["position"] = np.round(episode.sensors_m[sensor, 0], 3).tolist()
+        if not episode.is_active[sensor].all():
+            entry["on"] = _stretches(episode.is_active[sensor], step_s)
+        entries.append(entry | ({"is_hidden": True} if law.is_hidden else {}))
+    return entries
+
+
+def _stretches(is_active: np.ndarray[Any, np.dtype[np.bool_]], step_s: float) -> list[list[float]]:
+    """Pairs of seconds, half a step around the steps [T] at which a sensor looks."""
+    change = np.diff(np.concatenate([[0], is_active.astype(np.int8), [0]]))
+    first, stop = np.flatnonzero(change == 1), np.flatnonzero(change == -1)
+    return [[(a - 0.5) * step_s, (b - 0.5) * step_s] for a, b in zip(first.tolist(), stop.tolist(), strict=True)]
 
 
 class _Topics:

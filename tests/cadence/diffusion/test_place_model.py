@@ -14,6 +14,7 @@ from cadence.diffusion.place import PlaceModel
 from cadence.diffusion.place_frame import PlaceConfig, future_of, place_inputs, recorded_track, to_pieces, to_track
 from cadence.diffusion.settings import PlaceSampling
 from cadence.errors import ConfigError
+from cadence.evidence.estimator import with_past
 from cadence.network.place import PlaceNetworkConfig
 from cadence.recordings import ForecastWindows, Recordings, cut_windows
 from cadence.training import place_losses as training
@@ -347,3 +348,19 @@ def test_settings_of_sampling_that_cannot_be(changes: dict[str, float], says: st
 def test_settings_of_the_sampling_that_cannot_be(settings: dict[str, Any], says: str) -> None:
     with pytest.raises(ValueError, match=says):
         PlaceSampling(**settings)
+
+
+def test_a_grid_that_begins_before_now_shows_the_way_from_the_last_detection() -> None:
+    batch = windows(3).windows
+    estimator = model()
+    plain = estimator.sample(batch, 4)
+    found = estimator.sample(with_past(batch, 12), 4)
+    assert torch.equal(found.position_m[..., 12:, :], plain.position_m)
+    age = -torch.where(batch.detections.is_observed, batch.detections.time_s, -torch.inf).amax(-1) / batch.step_s
+    for row in range(3):
+        for agent in range(batch.num_agents):
+            past = found.position_m[row, :, agent, :12]  # three windows of one agent
+            is_there = torch.arange(-12, 0) >= -float(age[row, agent]) - 1e-6
+            assert torch.equal(past[0, :, 0].isfinite(), is_there)
+            steps = found.position_m[row, :, agent].diff(dim=-2).norm(dim=-1)
+            assert float(steps[steps.isfinite()].max()) < 1.01 * CONFIG.max_step_m

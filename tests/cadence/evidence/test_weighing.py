@@ -61,8 +61,8 @@ class Near:
             apart = apart * torch.tensor([name == self.agent for name in tracks.agent_ids])
         return apart.sum(-1) if self.is_joint else apart
 
-    def least_credible(self, time_s: torch.Tensor) -> torch.Tensor:
-        return torch.full(time_s.shape[:1], -7.0, dtype=torch.float64)
+    def contradicts(self, tracks: Tracks, log_likelihood: torch.Tensor) -> torch.Tensor:
+        return log_likelihood.amax(1) < -7.0
 
 
 def windows(*evidence: object, num: int = 1, num_agents: int = 1, datum_m: float = 0.0) -> WindowBatch:

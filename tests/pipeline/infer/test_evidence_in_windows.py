@@ -39,8 +39,8 @@ class NorthOf:
         is_meant = torch.tensor([name == "T0" for name in tracks.agent_ids])
         return torch.where(is_at & is_meant[:, None], -0.5 * south_m.nan_to_num() ** 2, 0.0).sum(-1)
 
-    def least_credible(self, time_s: torch.Tensor) -> torch.Tensor:
-        return torch.full(time_s.shape[:1], -10.0, dtype=torch.float64)
+    def contradicts(self, tracks: Tracks, log_likelihood: torch.Tensor) -> torch.Tensor:
+        return log_likelihood.amax(1) < -10.0
 
 
 def case(is_named=True):

@@ -1,0 +1,90 @@
+"""What the looks of a mission's sensors say: evidence for its windows, with an exponent that withheld detections chose."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+
+from cadence.bank.hindsight import withhold
+from cadence.constraints.obstacles import Obstacles
+from cadence.evidence.exponents import SAFE, ChosenExponent, choose_exponent
+from cadence.evidence.settings import WeighingConfig
+from cadence.evidence.silence import Looks, Silence
+from cadence.types import Estimator, Evidence
+from pipeline.looks import Footprint
+from pipeline.windows import MissionWindows
+
+_NUM_TESTED = 40
+_LEAST_HISTORY = 8
+"""Steps that a grid needs before now for withheld detections to lie on it."""
+
+
+@dataclass(frozen=True, eq=False)
+class HeardSilence:
+    """Evidence of silence, and what the summary and a remark say of it."""
+
+    evidence: tuple[Evidence, ...] = ()
+    about: dict[str, Any] = field(default_factory=dict)
+    remarks: tuple[str, ...] = ()
+
+
+def hear_silence(
+    looks: Sequence[tuple[Footprint, Looks]], obstacles: Obstacles, config: WeighingConfig, estimator: Estimator,
+    windows: MissionWindows, start_ns: int, knows_standing: bool,
+) -> HeardSilence:  # fmt: skip
+    """The silence that counts for an estimator.
+
+    Args:
+        looks: of the mission's footprints.
+        obstacles: that may hide.
+        config: whose exponent counts, where it states one.
+        estimator: fitted to the log.
+        windows: by name, without context.
+        start_ns: when the mission began.
+        knows_standing: sensors that stand are in the estimator's tracks already, and must not count twice.
+    """
+    if not looks or not config.is_used:
+        return HeardSilence()
+    heard = [(footprint, some) for footprint, some in looks if not (knows_standing and footprint.is_standing)]
+    remarks = []
+    if len(heard) < len(looks):
+        remarks.append("silence of sensors that stand is left out: this checkpoint has learned it with its tracks")
+    parts = [
+        Silence(tuple(some for footprint, some in heard if footprint.is_hidden == is_hidden), SAFE, obstacles=hiding)
+        for is_hidden, hiding in ((False, Obstacles.none()), (True, obstacles))
+        if any(footprint.is_hidden == is_hidden for footprint, _ in heard)
+    ]
+    if not parts:
+        return HeardSilence(remarks=tuple(remarks))
+    if config.exponent is None:
+        chosen = _chosen(parts, estimator, windows, start_ns)
+    else:
+        chosen = ChosenExponent(config.exponent, 0, {})
+    if chosen.exponent == 0.0:
+        why = "hypotheses weighed by it foresee withheld detections worse" if config.exponent is None else "it is set so"
+        remarks.append(f"silence of sensors is not used: {why} (infer.evidence.exponent)")
+        parts = []
+    evidence = tuple(Silence(part.looks, chosen.exponent, obstacles=part.obstacles) for part in parts)
+    about = {
+        "exponent": chosen.exponent,
+        "num_tests": chosen.num_tests,
+        "ratios": {f"{exponent:g}": ratio for exponent, ratio in chosen.ratios.items()},
+        "num_looks": sum(len(some) for _, some in heard),
+        "sensors": sorted({footprint.sensor for footprint, _ in heard}),
+    }
+    return HeardSilence(evidence, {"silence": about}, tuple(remarks))
+
+
+def _chosen(parts: Sequence[Silence], estimator: Estimator, windows: MissionWindows, start_ns: int) -> ChosenExponent:
+    """By bursts that are withheld from some of the windows, evenly spread."""
+    if windows.batch.origin_index < _LEAST_HISTORY:
+        return ChosenExponent(SAFE, 0, {})
+    located = windows.located(start_ns, Obstacles.none()).batch
+    shown, withheld = withhold(located, 0)
+    useful = torch.nonzero(withheld.is_observed.any(-1).any(-1))[:, 0]
+    if not len(useful):
+        return ChosenExponent(SAFE, 0, {})
+    pick = useful[torch.linspace(0, len(useful) - 1, min(_NUM_TESTED, len(useful))).round().long()]
+    whole = Silence(tuple(looks for part in parts for looks in part.looks), SAFE)
+    return choose_exponent(estimator, shown[pick], withheld[pick], whole)
