@@ -35,11 +35,13 @@ class SensorLaw:
 
     distance_m, probability  [M] straight between these points, nothing beyond the last
     is_hidden  land hides targets from it
+    is_always  it looks whether or not it is active
     """
 
     distance_m: Float64s
     probability: Float64s
     is_hidden: bool = False
+    is_always: bool = True
 
 
 @dataclass(frozen=True, eq=False)

@@ -118,7 +118,7 @@ class _Eyes:
         for range_m, share, is_hidden in zip(self.range_m, self.scan_share, self.needs_sight, strict=True):
             distance_m = np.linspace(0.0, 2.5 * range_m, _NUM_POINTS)
             probability = np.round(share * swerling_probability(distance_m, range_m), 4)
-            found.append(SensorLaw(distance_m, probability, bool(is_hidden)))
+            found.append(SensorLaw(distance_m, probability, bool(is_hidden), is_always=False))
         return tuple(found)
 
     def look(

@@ -99,7 +99,7 @@ def sensor_entries(episode: Episode, form: MissionForm) -> list[dict[str, Any]]:
             entry |= {"sensor": f"trackers/{number_in_group[sensor]}", "detects_as": name}
         elif is_grouped:
             entry["position"] = np.round(episode.sensors_m[sensor, 0], 3).tolist()
-        if not episode.is_active[sensor].all():
+        if not (law.is_always or episode.is_active[sensor].all()):
             entry["on"] = _stretches(episode.is_active[sensor], step_s)
         entries.append(entry | ({"is_hidden": True} if law.is_hidden else {}))
     return entries
