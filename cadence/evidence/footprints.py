@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 
 import numpy as np
-import shapely
 
 from cadence.arrays import Bools, Float64s
 
@@ -71,12 +70,16 @@ class Polygon:
     def __post_init__(self) -> None:
         if self.corners_m.ndim != 2 or self.corners_m.shape[1] != 2 or len(self.corners_m) < 3:
             raise ValueError("a polygon needs three corners [x, y] at least")
+        import shapely  # settings hold footprints, and are read where nothing heavy may be loaded
+
         area = shapely.Polygon(self.corners_m)
         if not (area.is_valid and area.area > 0):
             raise ValueError("a polygon whose area is zero, or whose edges cross")
 
     def holds(self, offset_m: Float64s, heading_rad: Float64s) -> Bools:
         """As `Sector.holds`; of a polygon on the ground offsets are positions in the mission frame."""
+        import shapely
+
         x, y = offset_m[..., 0], offset_m[..., 1]
         if not self.is_on_ground:
             cos, sin = np.cos(heading_rad), np.sin(heading_rad)
