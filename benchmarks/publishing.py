@@ -27,6 +27,7 @@ if TYPE_CHECKING:  # torch would enlarge the processes whose memory some scripts
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 PAGES = {
     "real_logs": ("real_logs",),
+    "answers": ("reliability",),
     "worlds": ("worlds",),
     "forecasts": ("table1", "table1_paper"),
     "forecast_limits": ("training_seeds", "narco_ceiling", "library_draws", "place_ablations"),
