@@ -36,6 +36,7 @@ PAGES = {
     "association": ("association",),
     "not_stated": ("measurement_noise",),
     "clutter": ("clutter",),
+    "evidence": ("silence",),
     "logs": ("log_reading", "plausibility", "log_writing"),
     "runs": ("batch", "batch_engines", "memory", "many_agents"),
     "rivals": (),

@@ -3,9 +3,15 @@
 Windows whose last detection is old, of the recorded episodes of the original simulator. P(detect) over distance and the
 exponent come from other episodes. Each estimator is compared with itself without silence, window by window.
 
-    python -m benchmarks.silence --reference ../shared/data/prison_reference --publish docs
+    python -m benchmarks.silence --reference ../shared/data/prison_reference --work out/silence --publish docs
+
+What a log gave is kept in the work folder, so that a killed call goes on where it was.
 """
 
+import argparse
+import json
+import math
+import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,6 +25,7 @@ from benchmarks.silence_episodes import (
     KINDS,
     STEP_S,
     RecordedEpisode,
+    fit_curves,
     looks_of,
     read_coverage,
     read_episode,
@@ -30,6 +37,7 @@ from cadence.evidence.footprints import DetectionCurve
 from cadence.evidence.silence import Silence
 from cadence.metrics import coverage as coverage_of
 from cadence.metrics import energy_score
+from cadence.metrics.bootstrap import Interval, bootstrap_mean, bootstrap_ratio
 from cadence.types import HypothesisSet, WindowBatch
 from pipeline.estimators.fitting import FittingData
 from pipeline.estimators.presets import load_estimator
@@ -39,11 +47,14 @@ from pipeline.windows import build_windows
 
 NAME = "silence"
 SETS = ("low", "med")
-EXPONENTS = (0.3, 0.6, 1.0)
+EXPONENTS = {"none": (0.3, 0.6, 1.0), "prison": (0.6,)}
 OLD_STEPS = 15
 LATER = 30
-FIT, TUNE, TEST = slice(0, 60), slice(60, 110), slice(150, 298)
-"""Logs of a set, by their order: curves are fitted on the first, the exponent is chosen on the second."""
+FIT, TUNED_ON, TEST = slice(0, 30), slice(60, 63), slice(150, 298)
+"""Logs of a set, by their order: curves are fitted on the first, the exponent was chosen on the second, the last are scored."""
+EXPONENT = 0.6
+LEAST_TOLD = 0.25
+"""Share of the windows, those with the smallest effective sample size, in which silence says most."""
 NUM_HYPOTHESES = 30
 
 
@@ -147,3 +158,109 @@ def _ranks(values: Float64s) -> Float64s:
     _, number, count = np.unique(values, return_inverse=True, return_counts=True)
     middle = np.cumsum(count) - 0.5 * (count - 1)
     return np.asarray(middle[number])
+
+
+def measured_rows(reference: Path, work: Path, num_logs: dict[str, list[int]]) -> list[publishing.Row]:
+    """The rows of the first so many test logs of each set, by checkpoint; those that were kept are not measured again."""
+    rows: list[publishing.Row] = []
+    work.mkdir(parents=True, exist_ok=True)
+    for which, name in enumerate(SETS):
+        logs = sorted((reference / name).glob("*.mcap"))
+        curves: dict[str, DetectionCurve] = {}
+        for checkpoint, nums in num_logs.items():
+            for path in logs[TEST][: nums[which]]:
+                kept = work / f"{path.stem}_{checkpoint}.json"
+                if not kept.is_file():
+                    curves = curves or fit_curves([read_episode(log) for log in logs[FIT]], read_coverage(reference))
+                    found = measure_log(path, [checkpoint], EXPONENTS[checkpoint], curves, reference)
+                    kept.write_text(json.dumps(found), encoding="utf-8")
+                rows += json.loads(kept.read_text(encoding="utf-8"))
+    return rows
+
+
+def summary(rows: Sequence[publishing.Row]) -> list[publishing.Row]:
+    """Each run beside the same estimator without silence, on the same windows; intervals over logs."""
+    plain = {(row["checkpoint"], row["log"], row["window"]): row for row in rows if row["exponent"] == 0}
+    runs = sorted({(row["checkpoint"], row["sensors"], row["exponent"]) for row in rows if row["exponent"] > 0})
+    found = []
+    for checkpoint, sensors, exponent in runs:
+        asked = (checkpoint, sensors, exponent)
+        own = [row for row in rows if (row["checkpoint"], row["sensors"], row["exponent"]) == asked]
+        before = [plain[checkpoint, row["log"], row["window"]] for row in own]
+        effective = np.array([row["num_effective"] for row in own], dtype=float)
+        told = effective <= np.nanquantile(effective, LEAST_TOLD)
+        line: publishing.Row = {"checkpoint": checkpoint, "sensors": sensors, "exponent": exponent, "windows": len(own)}
+        line |= {"logs": len({row["log"] for row in own}), "num_effective": float(np.nanmedian(effective))}
+        for column in ("now", "since", "past", "later"):
+            line |= publishing.columns(column, _ratio(own, before, column))
+        some = [row for row, is_told in zip(own, told, strict=True) if is_told]
+        line |= publishing.columns("told", _ratio(some, [b for b, is_told in zip(before, told, strict=True) if is_told], "now"))
+        for name, group in (("inside", own), ("inside_before", before)):
+            line |= publishing.columns(name, _mean(group, "inside"))
+        line |= publishing.columns("spearman", _mean(own, "spearman"))
+        line |= publishing.columns("cost", _ratio(own, before, "cpu_s"))
+        found.append(line)
+    return found
+
+
+def _values(rows: Sequence[publishing.Row], column: str) -> tuple[Float64s, list[str]]:
+    return np.array([row[column] for row in rows], dtype=float), [row["log"] for row in rows]
+
+
+def _ratio(own: Sequence[publishing.Row], before: Sequence[publishing.Row], column: str) -> Interval:
+    (top, logs), (bottom, _) = _values(own, column), _values(before, column)
+    return bootstrap_ratio(top, bottom, logs, np.random.default_rng(0))
+
+
+def _mean(rows: Sequence[publishing.Row], column: str) -> Interval:
+    return bootstrap_mean(*_values(rows, column), np.random.default_rng(0))
+
+
+def section(measured: publishing.Measurement) -> str:
+    """The table."""
+    names = {"none": "bank", "prison": "`prison`"}
+    lines = []
+    for row in measured.rows():
+        num_kinds = len(str(row["sensors"]).split("+"))
+        sensors = "all" if num_kinds == len(KINDS) else "moving"
+        lines.append(
+            [
+                names[row["checkpoint"]], sensors, f"{row['exponent']:g}", f"{row['windows']} / {row['logs']}",
+                *(publishing.interval(row, column, ".2f") for column in ("now", "past", "later", "told")),
+                f"{100 * row['inside_before']:.0f} → {100 * row['inside']:.0f} %", publishing.interval(row, "spearman", ".2f"),
+                f"{row['cost']:.1f}",
+            ]
+        )  # fmt: skip
+    heads = (
+        "hypotheses",
+        "sensors",
+        "exponent",
+        "windows / logs",
+        "now",
+        "undetected past",
+        "+30 steps",
+        "now, where it says most",
+    )
+    return publishing.table((*heads, "90 % region", "Spearman", "CPU of sampling"), lines)
+
+
+def main() -> int:
+    """Measure, print, publish."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--reference", type=Path, required=True)
+    parser.add_argument("--work", type=Path, default=Path("out/silence"))
+    parser.add_argument("--bank-logs", type=int, nargs=2, default=[12, 12], help="test logs of low and of med")
+    parser.add_argument("--place-logs", type=int, nargs=2, default=[24, 24], help="test logs of low and of med")
+    parser.add_argument("--publish", type=Path)
+    arguments = parser.parse_args()
+    rows = measured_rows(arguments.reference, arguments.work, {"none": arguments.bank_logs, "prison": arguments.place_logs})
+    facts = publishing.facts_of(NAME) | {"seed": 0, "hypotheses": NUM_HYPOTHESES, "fitted_on": "logs 0 to 29 of each set"}
+    facts |= {"tuned_on": "logs 60 to 62", "scored": "logs from 150 on"}
+    clean = [{key: None if isinstance(v, float) and math.isnan(v) else v for key, v in row.items()} for row in rows]
+    tables = {NAME: summary(rows), f"{NAME}_windows": clean}
+    publishing.publish(publishing.Measurement(NAME, facts, tables), section, arguments.publish)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
