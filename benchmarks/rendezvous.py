@@ -235,6 +235,8 @@ def joined(parts: list[Detections]) -> Detections:
     columns: dict[str, list[Tensor]] = {}
     for part in parts:
         for name, value in vars(part).items():
+            if value is None:  # heights, which no rendezvous has
+                continue
             padded = value.new_zeros(*value.shape[:2], num, *value.shape[3:])
             padded[:, :, : value.shape[2]] = value
             columns.setdefault(name, []).append(padded)

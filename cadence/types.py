@@ -21,12 +21,16 @@ class Detections:
     position_m    [B, A, N, 2] metres relative to the window datum
     covariance_m2 [B, A, N, 2, 2] symmetric positive definite position covariance
     is_observed   [B, A, N] bool, False on padding
+    height_m      [B, A, N] metres up from the vertical datum, NaN where unknown; None where no detection has a height
+    height_variance_m2  [B, A, N] NaN where not stated; None as above
     """
 
     time_s: Tensor
     position_m: Tensor
     covariance_m2: Tensor
     is_observed: Tensor
+    height_m: Tensor | None = None
+    height_variance_m2: Tensor | None = None
 
     def __post_init__(self) -> None:
         shape = tuple(self.time_s.shape)
@@ -35,6 +39,11 @@ class Detections:
             got = tuple(getattr(self, name).shape)
             if len(shape) != 3 or got != want:
                 raise ValueError(f"Detections.{name} has shape {got}, expected {want} ([B, A, N] plus space)")
+        if (self.height_m is None) != (self.height_variance_m2 is None):
+            raise ValueError("Detections: height_m and height_variance_m2 go together")
+        for height in (self.height_m, self.height_variance_m2):
+            if height is not None and tuple(height.shape) != shape:
+                raise ValueError(f"Detections: heights have shape {tuple(height.shape)}, expected {shape} ([B, A, N])")
         if self.is_observed.dtype != torch.bool:
             raise ValueError(f"Detections.is_observed must be bool, got {self.is_observed.dtype}")
 
@@ -45,9 +54,7 @@ class Detections:
 
     def __getitem__(self, windows: slice | Tensor) -> "Detections":
         """The same detections for a selection of windows (first axis)."""
-        return Detections(
-            self.time_s[windows], self.position_m[windows], self.covariance_m2[windows], self.is_observed[windows]
-        )
+        return Detections(**{name: value[windows] for name, value in vars(self).items() if value is not None})
 
 
 @dataclass(frozen=True, eq=False)
@@ -222,12 +229,14 @@ class HypothesisSet:
     status     [B][A] "ok", "no_detections", "infeasible" (nothing keeps the limits), "scarce" (hardly anything does), ...
     num_effective  [B, A] effective sample size: so many equally weighted tracks would tell as much; None where no evidence
                weighs hypotheses
+    height_m   [B, K, A, T] metres up from the vertical datum, NaN for agents without any height; None where no agent has one
     """
 
     position_m: Tensor
     weight: Tensor
     status: tuple[tuple[str, ...], ...]
     num_effective: Tensor | None = None
+    height_m: Tensor | None = None
 
     def __post_init__(self) -> None:
         b, k, a = self.position_m.shape[:3]
@@ -235,6 +244,8 @@ class HypothesisSet:
             raise ValueError(f"HypothesisSet.position_m has shape {tuple(self.position_m.shape)}, expected [B, K, A, T, 2]")
         if tuple(self.weight.shape) != (b, k):
             raise ValueError(f"HypothesisSet.weight has shape {tuple(self.weight.shape)}, expected {(b, k)}")
+        if self.height_m is not None and self.height_m.shape != self.position_m.shape[:-1]:
+            raise ValueError(f"HypothesisSet.height_m has shape {tuple(self.height_m.shape)}, expected [B, K, A, T]")
         if len(self.status) != b or any(len(row) != a for row in self.status):
             raise ValueError("HypothesisSet.status must hold one word per window and agent")
         if self.num_effective is not None and tuple(self.num_effective.shape) != (b, a):

@@ -73,5 +73,6 @@ def shared_detections(windows: WindowBatch) -> WindowBatch:
         d.covariance_m2.reshape(b, 1, a * n, 2, 2).gather(2, order[..., None, None].expand(-1, -1, -1, 2, 2)),
         is_observed.gather(2, order),
     )
-    everybody = Detections(*(value.expand(b, a, *value.shape[2:]) for value in vars(merged).values()))
+    plane = (value for value in vars(merged).values() if value is not None)  # no model of a place knows heights
+    everybody = Detections(*(value.expand(b, a, *value.shape[2:]) for value in plane))
     return dataclasses.replace(windows, detections=everybody)

@@ -127,7 +127,9 @@ class InOrder:
         assert windows.num_agents == 2
         parts = []
         for agent, shift_m in ((0, 0.0), (1, 300.0)):
-            columns = {name: value[:, agent : agent + 1] for name, value in vars(windows.detections).items()}
+            columns = {
+                name: value[:, agent : agent + 1] for name, value in vars(windows.detections).items() if value is not None
+            }
             alone = dataclasses.replace(windows, detections=Detections(**columns))
             parts.append(Straight(shift_m).sample(alone, num_hypotheses).position_m)
         weight = torch.full((windows.num_windows, num_hypotheses), 1.0 / num_hypotheses, dtype=torch.float64)
