@@ -22,6 +22,7 @@ class AgentHypotheses:
                 that the agent is no part of
     num_effective  effective sample size of its tracks; None where no evidence weighs them
     probability, association_entropy_bits  of its being there, and of who caused its detections; None: their origin is known
+    height_m    [K, T] float32 metres up from the vertical datum of the mission's frame; None where its height is unknown
     """
 
     agent_id: str
@@ -35,6 +36,7 @@ class AgentHypotheses:
     probability: float | None = None
     association_entropy_bits: float | None = None
     num_effective: float | None = None
+    height_m: Float32s | None = None
 
     @property
     def is_live(self) -> bool:
@@ -103,6 +105,7 @@ class _Rows:
     weight: Float32s
     datum_m: Float64s
     position_m: Float32s
+    height_m: Float32s | None
     log_id: str
     spans: dict[tuple[int, str], tuple[int, int]]
 
@@ -129,6 +132,7 @@ class _Rows:
             table["weight"].to_numpy(),
             np.stack([table["datum_x_m"].to_numpy(), table["datum_y_m"].to_numpy()], axis=-1),
             _positions(table, path),
+            _heights(table),
             table["log_id"][0].as_py() if table.num_rows else "",
             spans,
         )
@@ -143,6 +147,18 @@ def _positions(table: pa.Table, path: Path) -> Float32s:
     flat = column.flatten().flatten().to_numpy(zero_copy_only=True)
     views: Float32s = flat.reshape(-1, column.type.list_size, 2)
     return views
+
+
+def _heights(table: pa.Table) -> Float32s | None:
+    """Heights [N, T], NaN where null; None of a table without them."""
+    if "height_m" not in table.column_names:
+        return None
+    column, num_steps = table["height_m"].combine_chunks(), table.schema.field("height_m").type.list_size
+    if isinstance(column, pa.ChunkedArray):  # an empty table keeps its chunks
+        return np.zeros((0, num_steps), np.float32)
+    heights: Float32s = column.values.slice(column.offset * num_steps, len(column) * num_steps).to_numpy(zero_copy_only=False)
+    heights = heights.reshape(-1, num_steps)
+    return np.where(column.is_valid().to_numpy(zero_copy_only=False)[:, None], heights, np.float32(np.nan))
 
 
 def _status_groups(windows: pa.Table) -> Iterator[list[dict[str, object]]]:
@@ -188,6 +204,7 @@ def _window(group: list[dict[str, object]], rows: _Rows, path: Path) -> WindowHy
 
 def _agent(row: dict[str, object], span: tuple[int, int] | None, rows: _Rows) -> AgentHypotheses:
     begin, end = span or (0, 0)
+    height_m = None if rows.height_m is None else rows.height_m[begin:end]
     datum = rows.datum_m[begin] if span else np.zeros(2)
     return AgentHypotheses(
         agent_id=str(row["agent_id"]),
@@ -201,6 +218,7 @@ def _agent(row: dict[str, object], span: tuple[int, int] | None, rows: _Rows) ->
         probability=_optional_float(row.get("probability")),
         association_entropy_bits=_optional_float(row.get("association_entropy_bits")),
         num_effective=_optional_float(row.get("num_effective")),
+        height_m=None if height_m is None or np.isnan(height_m).all() else height_m,
     )
 
 

@@ -10,16 +10,20 @@ import pyarrow.parquet as pq
 
 from cadence.errors import InputError
 from pipeline.documents import parse_json
-from schemas.tables import VERSION
+from schemas.tables import HEIGHT_COLUMNS, HEIGHT_VERSION, VERSION
 
 
 @dataclass(frozen=True)
 class Frame:
-    """The mission frame: x east, y north, metres. The datum is set for georeferenced logs."""
+    """The mission frame: x east, y north, metres. The datum is set for georeferenced logs.
+
+    vertical_datum  what heights count from, in words; None where none are used
+    """
 
     frame_id: str
     latitude_deg: float | None = None
     longitude_deg: float | None = None
+    vertical_datum: str | None = None
 
     @property
     def is_georeferenced(self) -> bool:
@@ -29,13 +33,16 @@ class Frame:
 
 def write_table(table: pa.Table, path: Path, name: str, frame: Frame) -> None:
     """Write `table` (its schema must be that of `name` in `schemas.tables`) with version and frame in its metadata."""
-    pq.write_table(table.replace_schema_metadata(table_metadata(name, frame)), path, compression="zstd")
+    version = HEIGHT_VERSION if HEIGHT_COLUMNS.get(name) in table.column_names else VERSION
+    pq.write_table(table.replace_schema_metadata(table_metadata(name, frame, version)), path, compression="zstd")
 
 
-def table_metadata(name: str, frame: Frame) -> dict[str, str]:
+def table_metadata(name: str, frame: Frame, version: int = VERSION) -> dict[str, str]:
     """What the metadata of a table's schema say of it: its name, the version and the frame."""
     frame_json = {"frame_id": frame.frame_id, "latitude_deg": frame.latitude_deg, "longitude_deg": frame.longitude_deg}
-    return {"cadence.table": name, "cadence.version": str(VERSION), "cadence.frame": json.dumps(frame_json)}
+    if frame.vertical_datum is not None:
+        frame_json["vertical_datum"] = frame.vertical_datum
+    return {"cadence.table": name, "cadence.version": str(version), "cadence.frame": json.dumps(frame_json)}
 
 
 def read_table(path: Path, name: str) -> tuple[pa.Table, Frame]:
@@ -51,7 +58,7 @@ def read_table(path: Path, name: str) -> tuple[pa.Table, Frame]:
     except (pa.ArrowException, OSError, ValueError, TypeError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise InputError(f"{path}: not a readable cadence table ({reason}); run its stage again with --force") from error
-    if kind != name or version != str(VERSION):
+    if kind != name or version not in (str(VERSION), str(HEIGHT_VERSION)):
         found = f"{kind or 'an unknown table'} version {version or '?'}"
-        raise InputError(f"{path}: holds {found}, expected {name} version {VERSION}; run its stage again")
+        raise InputError(f"{path}: holds {found}, expected {name} version {VERSION} or {HEIGHT_VERSION}; run its stage again")
     return table, frame

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -16,21 +17,28 @@ UNKNOWN_AGENT = "unknown"
 
 @dataclass(frozen=True, eq=False)
 class DetectionTrack:
-    """N detections of one agent, or of one stream, sorted by time: time_ns [N], position_m [N, 2], covariance_m2 [N, 2, 2]."""
+    """N detections of one agent, or of one stream, sorted by time: time_ns [N], position_m [N, 2], covariance_m2 [N, 2, 2].
+
+    height_m, height_variance_m2  [N] NaN where unknown; None where heights are not used
+    """
 
     time_ns: Int64s
     position_m: Float64s
     covariance_m2: Float64s
+    height_m: Float64s | None = None
+    height_variance_m2: Float64s | None = None
 
     @staticmethod
     def one_behind_the_other(tracks: Iterable["DetectionTrack"]) -> "DetectionTrack":
         """All detections of the tracks, sorted by time within each of them only."""
-        columns = zip(*((track.time_ns, track.position_m, track.covariance_m2) for track in tracks), strict=True)
-        return DetectionTrack(*(np.concatenate(column) for column in columns))
+        columns = zip(*(vars(track).values() for track in tracks), strict=True)
+        joined: list[Any] = [None if column[0] is None else np.concatenate(column) for column in columns]
+        return DetectionTrack(*joined)
 
     def __getitem__(self, rows: slice | Int64s | Bools) -> "DetectionTrack":
         """A selection of the detections."""
-        return DetectionTrack(self.time_ns[rows], self.position_m[rows], self.covariance_m2[rows])
+        chosen: list[Any] = [None if column is None else column[rows] for column in vars(self).values()]
+        return DetectionTrack(*chosen)
 
     def __len__(self) -> int:
         return len(self.time_ns)
@@ -52,7 +60,15 @@ def track_of(rows: pa.Table, default_sigma_m: float) -> DetectionTrack:
         given = np.isfinite(xx.astype(np.float64)) & np.isfinite(yy.astype(np.float64))
         stacked = np.stack([xx, np.nan_to_num(xy), np.nan_to_num(xy), yy], axis=-1).astype(np.float64).reshape(-1, 2, 2)
         covariance[given] = stacked[given]
-    return DetectionTrack(rows["time_ns"].to_numpy(), position, covariance)
+    return DetectionTrack(rows["time_ns"].to_numpy(), position, covariance, *_heights(rows))
+
+
+def _heights(rows: pa.Table) -> tuple[Float64s | None, Float64s | None]:
+    """Heights and their variances [N], of a table that says that they are used."""
+    if "cov_zz_m2" not in rows.column_names:
+        return None, None
+    height_m, variance_m2 = (rows[name].to_numpy().astype(np.float64) for name in ("z_m", "cov_zz_m2"))
+    return height_m, variance_m2
 
 
 def interpolated(time_ns: Int64s, position_m: Float64s, at_ns: Int64s, max_gap_ns: float) -> Float64s:

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import torch
 from torch import Tensor
 
@@ -94,7 +95,11 @@ def padded_detections(pool: DetectionTrack, pick: Int64s, origins_ns: Int64s, da
     time_s = np.where(is_observed, (pool.time_ns[pick] - origins_ns[:, None, None]) * 1e-9, 0.0)
     position_m = np.where(is_observed[..., None], pool.position_m[pick] - datum_m[:, None, None], 0.0)
     covariance_m2 = np.where(is_observed[..., None, None], pool.covariance_m2[pick], np.eye(2))
-    return Detections(*(torch.from_numpy(value) for value in (time_s, position_m, covariance_m2, is_observed)))
+    columns = [time_s, position_m, covariance_m2, is_observed]
+    columns += [
+        np.where(is_observed, value[pick], np.nan) for value in (pool.height_m, pool.height_variance_m2) if value is not None
+    ]
+    return Detections(*map(torch.from_numpy, columns))
 
 
 def window_seeds(seed: int, num_windows: int) -> Tensor:
@@ -127,7 +132,7 @@ def truth_on_grid(truth: pa.Table, windows: MissionWindows, max_gap_s: float) ->
 
     See `interpolated`; unknown between samples that lie more than `max_gap_s` apart.
     """
-    step_times = windows.origins_ns[:, None] + np.round(windows.batch.time_s.numpy() * 1e9).astype(np.int64)
+    step_times = _step_times_ns(windows)
     position = np.full((*step_times.shape[:1], len(windows.agent_ids), step_times.shape[1], 2), np.nan)
     tracks = dict(agent_tracks(truth, 0.0))
     for index, agent in enumerate(windows.agent_ids):
@@ -137,6 +142,25 @@ def truth_on_grid(truth: pa.Table, windows: MissionWindows, max_gap_s: float) ->
             position[:, index] = found - windows.datum_m[:, None]
     is_known_everywhere = np.isfinite(position[..., 0])
     return torch.from_numpy(np.nan_to_num(position)), torch.from_numpy(is_known_everywhere)
+
+
+def heights_on_grid(truth: pa.Table, windows: MissionWindows, max_gap_s: float) -> Tensor:
+    """Heights of the truth at every step [B, A, T], as `truth_on_grid`; NaN where they are unknown."""
+    step_times = _step_times_ns(windows)
+    height = np.full((len(step_times), len(windows.agent_ids), step_times.shape[1]), np.nan)
+    known = truth.filter(pc.is_valid(truth["z_m"])).sort_by("time_ns")
+    for index, agent in enumerate(windows.agent_ids):
+        own = known.filter(pc.equal(known["agent_id"], agent))
+        if own.num_rows:
+            height_m = np.repeat(own["z_m"].to_numpy()[:, None], 2, axis=1)
+            height[:, index] = interpolated(own["time_ns"].to_numpy(), height_m, step_times, max_gap_s * 1e9)[..., 0]
+    return torch.from_numpy(height)
+
+
+def _step_times_ns(windows: MissionWindows) -> Int64s:
+    """Times of all steps [B, T]."""
+    steps_ns: Int64s = windows.origins_ns[:, None] + np.round(windows.batch.time_s.numpy() * 1e9).astype(np.int64)
+    return steps_ns
 
 
 def _one_per_cell(track: DetectionTrack, grid: Grid) -> DetectionTrack:

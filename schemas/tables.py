@@ -7,7 +7,10 @@ name of the mission frame, and for georeferenced logs its datum, `latitude_deg` 
 import pyarrow as pa
 
 VERSION = 1
-"""Raised when a column changes meaning; readers refuse other versions."""
+"""Raised when a column changes meaning; readers refuse versions that they do not know."""
+HEIGHT_VERSION = 2
+"""Of tables with this column of heights; without it they are as they were, and say so."""
+HEIGHT_COLUMNS = {"detections": "cov_zz_m2", "hypotheses": "height_m"}
 
 DETECTIONS = pa.schema(
     [
@@ -28,6 +31,9 @@ DETECTIONS = pa.schema(
         pa.field("sequence", pa.int64(), nullable=False),
     ]
 )
+
+DETECTIONS_WITH_HEIGHT = DETECTIONS.append(pa.field("cov_zz_m2", pa.float64()))  # null = exact up to a floor
+"""Where heights are used: z_m is metres up from the vertical datum that the table's frame names, null where unknown."""
 
 TRUTH = pa.schema(
     [
@@ -152,13 +158,15 @@ then of all. Between two steps, also from one block to the next, a track is the 
 """
 
 
-def hypotheses_schema(num_steps: int) -> pa.Schema:
+def hypotheses_schema(num_steps: int, has_height: bool = False) -> pa.Schema:
     """HYPOTHESES: one row per window, hypothesis and agent (only agents with status ok or infeasible).
 
     Step i lies at origin_ns + (i - origin_index) * step_ns; position_m is [T, 2] float32 relative to the datum
     (datum_x_m, datum_y_m) in the mission frame. weight is that of the joint hypothesis: equal for all its agents. Where
     detections are of unknown origin, an agent need not be part of every hypothesis: NaN where it is not.
+    height_m is [T] metres up from the vertical datum, null for agents of unknown height; only where heights are used.
     """
+    height = [pa.field("height_m", pa.list_(pa.float32(), num_steps))] if has_height else []
     return pa.schema(
         [
             pa.field("log_id", pa.string(), nullable=False),
@@ -172,5 +180,6 @@ def hypotheses_schema(num_steps: int) -> pa.Schema:
             pa.field("datum_x_m", pa.float64(), nullable=False),
             pa.field("datum_y_m", pa.float64(), nullable=False),
             pa.field("position_m", pa.list_(pa.list_(pa.float32(), 2), num_steps), nullable=False),
+            *height,
         ]
     )

@@ -58,7 +58,7 @@ class WithEvidence:
             return self.estimator.sample(windows, num_hypotheses)
         asked = with_past(windows, self.num_past)
         found = self.estimator.sample(asked, num_hypotheses)
-        said = hear(asked, found.position_m)
+        said = hear(asked, found.position_m, found.height_m)
         if not bool(said.is_touched.any()):
             return self._cut(found)
         weighed = self._chosen(found, said, asked, num_hypotheses)
@@ -74,25 +74,28 @@ class WithEvidence:
         for some in torch.split(is_short.nonzero()[:, 0], at_once):
             part = windows[some]
             found = self.estimator.sample(part, num_drawn)
-            weighed = _put(weighed, some, self._chosen(found, hear(part, found.position_m), part, num))
+            weighed = _put(weighed, some, self._chosen(found, hear(part, found.position_m, found.height_m), part, num))
         return weighed
 
     def _chosen(self, found: HypothesisSet, said: Said, windows: WindowBatch, num: int) -> HypothesisSet:
         """`num` weighted hypotheses of those that were drawn; windows that nothing speaks of keep their first ones."""
         position_m, weight = found.position_m[:, :num].clone(), found.weight[:, :num].clone()
+        height_m = None if found.height_m is None else found.height_m[:, :num].clone()
         num_effective = torch.full(said.is_contradicted.shape, torch.nan, dtype=torch.float64)
         for row in said.is_touched.nonzero()[:, 0].tolist():
             choice = self._choice(found, said, row, int(windows.seeds[row]), num)
             index = torch.from_numpy(choice.index).expand(num, position_m.shape[2])
             agents = torch.arange(position_m.shape[2]).expand_as(index)
             position_m[row] = found.position_m[row][index, agents]
+            if height_m is not None and found.height_m is not None:
+                height_m[row] = found.height_m[row][index, agents]
             weight[row] = torch.from_numpy(choice.weight).to(weight.dtype)
             num_effective[row] = torch.from_numpy(choice.num_effective)
         status = tuple(
             tuple(CONTRADICTED if odd and word == "ok" else word for odd, word in zip(odds, words, strict=True))
             for odds, words in zip(said.is_contradicted.tolist(), found.status, strict=True)
         )
-        return HypothesisSet(position_m, weight, status, torch.where(windows.is_active, num_effective, torch.nan))
+        return HypothesisSet(position_m, weight, status, torch.where(windows.is_active, num_effective, torch.nan), height_m)
 
     def _choice(self, found: HypothesisSet, said: Said, row: int, seed: int, num: int) -> Choice:
         generator = numpy_stream(seed, "evidence")
@@ -106,7 +109,10 @@ class WithEvidence:
 
     def _cut(self, found: HypothesisSet) -> HypothesisSet:
         """Hypotheses on the grid that was asked for."""
-        return found if not self.num_past else dataclasses.replace(found, position_m=found.position_m[..., self.num_past :, :])
+        if not self.num_past:
+            return found
+        height_m = None if found.height_m is None else found.height_m[..., self.num_past :]
+        return dataclasses.replace(found, position_m=found.position_m[..., self.num_past :, :], height_m=height_m)
 
 
 def weighed_as_drawn(found: HypothesisSet, windows: WindowBatch, config: WeighingConfig) -> HypothesisSet:
@@ -159,7 +165,11 @@ def _put(whole: HypothesisSet, rows: Tensor, part: HypothesisSet) -> HypothesisS
     status = list(whole.status)
     for row, words in zip(rows.tolist(), part.status, strict=True):
         status[row] = words
-    return HypothesisSet(position_m, weight, tuple(status), num_effective)
+    height_m = whole.height_m
+    if height_m is not None and part.height_m is not None:
+        height_m = height_m.clone()
+        height_m[rows] = part.height_m
+    return HypothesisSet(position_m, weight, tuple(status), num_effective, height_m)
 
 
 def _with_few(found: HypothesisSet, num_hypotheses: int) -> HypothesisSet:

@@ -32,7 +32,7 @@ class Said:
         return not bool(self.joint.any())
 
 
-def known_tracks(windows: WindowBatch, position_m: Tensor) -> Tracks:
+def known_tracks(windows: WindowBatch, position_m: Tensor, height_m: Tensor | None = None) -> Tracks:
     """Hypotheses [B, K, A, T, 2] as evidence may see them: up to the window origin, in the mission's frame and time."""
     context = windows.required_context("evidence")
     if context.elapsed_s is None:
@@ -40,12 +40,12 @@ def known_tracks(windows: WindowBatch, position_m: Tensor) -> Tracks:
     num_known = windows.origin_index + 1
     place_m = position_m[..., :num_known, :].double() + context.datum_m[:, None, None, None]
     time_s = context.elapsed_s.double()[:, None] + windows.time_s[:num_known].double()
-    return Tracks(place_m, time_s, context.agent_ids)
+    return Tracks(place_m, time_s, context.agent_ids, None if height_m is None else height_m[..., :num_known])
 
 
-def hear(windows: WindowBatch, position_m: Tensor) -> Said:
+def hear(windows: WindowBatch, position_m: Tensor, height_m: Tensor | None = None) -> Said:
     """What all evidence in the context of `windows` says of hypotheses [B, K, A, T, 2] that were drawn for them."""
-    tracks = known_tracks(windows, position_m)
+    tracks = known_tracks(windows, position_m, height_m)
     b, k, a = position_m.shape[:3]
     joint, apart = torch.zeros(b, k, dtype=torch.float64), torch.zeros(b, k, a, dtype=torch.float64)
     is_touched, is_contradicted = torch.zeros(b, dtype=torch.bool), torch.zeros(b, a, dtype=torch.bool)

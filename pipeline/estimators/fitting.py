@@ -13,6 +13,7 @@ from torch import Tensor
 from cadence.bank.bank import Bank
 from cadence.bank.hindsight import Test, withhold
 from cadence.bank.pool import BankPool, pool_by_hindsight
+from cadence.height.bank import HeightBank
 from cadence.types import Detections, WindowBatch
 from pipeline.grids import Grid
 from pipeline.windows import MissionWindows, build_windows, fit_tracks, later_detections
@@ -39,6 +40,10 @@ class FittingData:
     def of(detections: pa.Table, grid: Grid, windows: MissionWindows, default_sigma_m: float = 0.0) -> "FittingData":
         """The data with its stretches cut."""
         return FittingData(detections, grid, windows, fit_tracks(detections, grid, default_sigma_m), default_sigma_m)
+
+    def fitted_heights(self) -> HeightBank:
+        """The bank of height fitted to the log, which has heights."""
+        return HeightBank().fit(self.tracks, self.grid.step_s)
 
     def fitted_bank(self) -> BankPool:
         """The bank fitted to the log: weights by likelihood, its settings pooled by hindsight."""

@@ -32,6 +32,7 @@ from pipeline.logs.channels import Batch
 from pipeline.logs.decode import UndecodableChannel
 from pipeline.logs.reader import Channel, RawMessage
 from pipeline.mapping.message_path import Place, at_place
+from pipeline.mapping.message_type import VerticalDatum
 from pipeline.mapping.sources import LOG_TIME, PATH_KEYS, PUBLISH_TIME, SourceConfig, resolve_paths
 
 Point = tuple[Place, Any, Any, Any]
@@ -59,6 +60,9 @@ class ChannelReader:
         fields = {name: self._field(name, getattr(paths, name)) for name in _OTHERS}
         self.fields = {name: reader for name, reader in fields.items() if reader.paths}
         self.conditions = Conditions(paths.where, source.where is not None)
+        self.vertical_datum: VerticalDatum = paths.vertical_datum
+        if self.vertical_datum == "not stated" and not self.is_geodetic:
+            self.vertical_datum = "frame"
         self.is_ned, self.is_north_first = paths.frame_convention == "ned", paths.is_north_first
         self.unknown = NONE_COVARIANCE if source.sigma_m is None else isotropic(source.sigma_m**2)
         self.rows = Rows()

@@ -30,6 +30,7 @@ class ExtractConfig:
     default_sigma_m  standard deviation of detections that state none; without it that of their own likelihood, where they show
                      any noise, else they count as exact
     max_speed_mps    single positions that could only be reached and left again faster are recorder faults (see `spikes`)
+    is_height_used   z or altitude is inferred as well, where detections have it
     trusted          kinds of suspicion that are not looked for: what the log says of them counts as it stands (docs/formats.md)
     is_strict        refuse a log of which something is suspected (`--strict`)
     datum            [latitude, longitude] in degrees of x = y = 0; by default the median of all positions, and unknown for
@@ -56,6 +57,7 @@ class ExtractConfig:
     datum: tuple[float, float] | None = None
     obstacles: ObstacleSources = field(default_factory=ObstacleSources)
     sensors: tuple[SensorConfig, ...] = ()
+    is_height_used: bool = True
     trusted: tuple[LogKind, ...] = ()
     is_strict: bool = False
 

@@ -13,6 +13,7 @@ from pipeline.counted import counted
 from pipeline.extract.channel_reader import ChannelReader
 from pipeline.extract.config import ExtractConfig
 from pipeline.extract.fill_ins import without_fill_ins
+from pipeline.extract.height_units import heights_in_metres
 from pipeline.extract.hemispheres import check_hemispheres
 from pipeline.extract.joined import check_joined
 from pipeline.extract.mission_clock import on_one_clock
@@ -122,6 +123,7 @@ def _in_place(
     found = [
         (reader, in_true_units(reader.source, role, rows, suspicions)) for (reader, _), rows in zip(parts, timed, strict=True)
     ]
+    found = [(reader, heights_in_metres(reader.source, role, rows, suspicions)) for reader, rows in found]
     filled = [(reader, without_frozen(without_fill_ins(rows, role, suspicions), role, suspicions)) for reader, rows in found]
     for _, rows in filled:
         check_wrapped(rows, role, suspicions)

@@ -8,11 +8,11 @@ import pyarrow as pa
 from cadence.arrays import Objects
 from pipeline.extract.collapse import Collapsed
 from pipeline.extract.positions import Positions
-from schemas.tables import DETECTIONS
+from schemas.tables import DETECTIONS, DETECTIONS_WITH_HEIGHT
 
 
-def detection_table(log_id: str, collapsed: Collapsed) -> pa.Table:
-    """DETECTIONS of a log."""
+def detection_table(log_id: str, collapsed: Collapsed, has_height: bool = False) -> pa.Table:
+    """DETECTIONS of a log, with variances of heights where these are used."""
     rows = collapsed.positions
     columns = {
         "log_id": pa.array([log_id] * len(rows)), "time_ns": rows.time_ns, "sensor_id": rows.sensor, "agent_id": rows.agent,
@@ -20,7 +20,9 @@ def detection_table(log_id: str, collapsed: Collapsed) -> pa.Table:
         "cov_xy_m2": rows.covariance_m2[:, 1], "cov_yy_m2": rows.covariance_m2[:, 2], "score": rows.score,
         "num_merged": collapsed.num_merged, "topic": rows.topic, "log_time_ns": rows.log_time_ns, "sequence": rows.sequence,
     }  # fmt: skip
-    return _table(columns, DETECTIONS)
+    if not has_height:
+        return _table(columns, DETECTIONS)
+    return _table(columns | {"cov_zz_m2": rows.height_covariance_m2[:, 2]}, DETECTIONS_WITH_HEIGHT)
 
 
 def track_table(log_id: str, rows: Positions, key: str, names: Objects, schema: pa.Schema) -> pa.Table:

@@ -5,6 +5,7 @@ Decoded messages become rows in the mission frame, sorted by time; whatever is l
 
 import contextlib
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from pipeline.extract.accuracy import with_accuracy
 from pipeline.extract.channel_reader import ChannelReader
 from pipeline.extract.collapse import Collapsed, collapse
 from pipeline.extract.config import ExtractConfig
+from pipeline.extract.heights import settle_heights
 from pipeline.extract.logged_sensors import logged_sensors
 from pipeline.extract.looks import collect_looks
 from pipeline.extract.mission_rows import rows_in_frame
@@ -48,6 +50,8 @@ def write_tables(log: MissionLog, folder: Path, config: ExtractConfig, progress:
         readers = select_readers(stated, config.suggest, config.thinning, channels)
         counts = read_positions(log, readers, progress, *_cut_ns(log, config), config.max_detections)
         rows, frame = rows_in_frame(log, readers, config, counts, suspicions, transforms)
+    rows, heights = settle_heights(rows, readers, config.is_height_used)
+    frame = replace(frame, vertical_datum=heights.datum)
     counts["unselected_topics"] = len({c.topic for c in log.channels} - {c.topic for c in channels})
     accurate, accuracies = _with_accuracy(rows["detections"], readers, config, suspicions)
     detections = collapse(accurate, config.simultaneity_s)
@@ -60,7 +64,8 @@ def write_tables(log: MissionLog, folder: Path, config: ExtractConfig, progress:
     if sensors:
         looks, footprints = collect_looks(sensors, rows["poses"], accurate, (log.start_ns, log.end_ns), suspicions)
         write_looks(folder, log_id, looks, footprints, frame)
-    write_table(detection_table(log_id, detections), folder / "detections.parquet", "detections", frame)
+    found = detection_table(log_id, detections, heights.datum is not None)
+    write_table(found, folder / "detections.parquet", "detections", frame)
     if len(truth):
         write_table(track_table(log_id, truth, "agent_id", truth.agent, TRUTH), folder / "truth.parquet", "truth", frame)
     poses = rows["poses"]
@@ -73,6 +78,8 @@ def write_tables(log: MissionLog, folder: Path, config: ExtractConfig, progress:
     records = [accuracy.record() for accuracy in accuracies]
     for line in few(lines(records)):
         progress.note(f"extract: {line}")
+    for line in heights.remarks:
+        progress.note(f"extract: {line}")
     for channel, why in unused.items():
         progress.note(f"extract: {channel} may hold detections and is not used: {why}")
     transforms.tell()
@@ -84,7 +91,8 @@ def write_tables(log: MissionLog, folder: Path, config: ExtractConfig, progress:
         refused = "; ".join(few(suspicions.lines()))
         raise ImplausibleInputError(f"{log.path}: refused by --strict, as something in it is suspected: {refused}")
     summary = summarise(log, readers, detections.positions, truth, poses, frame, counts, suspicions, len(obstacles))
-    return summary | {"accuracy": records, "unused": unused, "transforms": transforms.summary(counts)}
+    told = {"accuracy": records, "unused": unused, "transforms": transforms.summary(counts)}
+    return summary | told | ({"height": dict(heights.record)} if heights.record else {})
 
 
 @contextlib.contextmanager

@@ -76,7 +76,10 @@ def _joined(begin: int, all_columns: Tensor, piece: Piece, associated: Associate
         tuple(_worst([row[u] for u in used.unique().tolist() if u >= 0]) for used in columns.unbind(-1))
         for row, columns in zip(drawn.status, column, strict=True)
     )
-    whole = HypothesisSet(joined, drawn.weight, found)
+    height = drawn.height_m
+    if height is not None:
+        height = torch.where((column >= 0)[..., None], height.gather(2, pick[..., 0]), torch.nan)
+    whole = HypothesisSet(joined, drawn.weight, found, height_m=height)
     return begin + part, weighed_as_drawn(whole, associated.windows.batch[begin + part], weighing)
 
 
@@ -102,6 +105,7 @@ def _draw_associated(
     shape = (len(part), num_hypotheses, num_agents, associated.windows.batch.num_steps, 2)
     position = torch.full(shape, torch.nan, dtype=torch.float64)
     weight = torch.zeros(len(part), num_hypotheses, dtype=torch.float64)
+    height = None if some.batch.detections.height_m is None else torch.full(shape[:-1], torch.nan, dtype=torch.float64)
     found: list[list[set[str]]] = [[set() for _ in range(num_agents)] for _ in part]
     for size in np.unique(count).tolist():
         chosen = np.flatnonzero(count == size)
@@ -110,8 +114,11 @@ def _draw_associated(
         columns = torch.from_numpy(first[chosen])[:, None] + torch.arange(size)
         position[rows, columns] = drawn.position_m.double()
         weight[rows, columns] = drawn.weight.double() * size / num_hypotheses
+        if height is not None and drawn.height_m is not None:
+            height[rows, columns] = drawn.height_m
         for row, words in zip(rows[:, 0].tolist(), drawn.status, strict=True):
             for agent, word in enumerate(words):
                 found[row][agent].add(word)
     status = tuple(tuple(_worst(list(words)) for words in row) for row in found)
-    return part, weighed_as_drawn(HypothesisSet(position, weight, status), associated.windows.batch[part], weighing)
+    whole = HypothesisSet(position, weight, status, height_m=height)
+    return part, weighed_as_drawn(whole, associated.windows.batch[part], weighing)

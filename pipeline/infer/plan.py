@@ -13,12 +13,13 @@ from cadence.constraints.obstacles import Obstacles
 from cadence.errors import ImplausibleInputError
 from cadence.evidence.estimator import WithEvidence
 from cadence.evidence.silence import Looks
+from cadence.height.bank import HeightBeside
 from cadence.types import Evidence
 from pipeline.associations import AssociatedWindows, Sources, build_associated_windows, tell_sources
 from pipeline.checkpoints import DEFAULT
 from pipeline.estimators.fit_test import FitTest, fit_test
 from pipeline.estimators.fitting import FittingData
-from pipeline.estimators.loaded import Loaded
+from pipeline.estimators.loaded import Fitted, Loaded
 from pipeline.estimators.presets import load_estimator
 from pipeline.infer.config import InferConfig
 from pipeline.infer.draws import Piece, draw_associations, draw_tracks, draw_windows
@@ -111,7 +112,7 @@ class Plan:
                 plan = Plan.of(replace(config, checkpoint=DEFAULT), detections, beside, progress)
                 return replace(plan, suspicions=suspicions, about={**plan.about, "fit_test": asdict(test)})
             about["fit_test"] = None if test is None else asdict(test)
-        fitted = loaded.fitted(data)
+        fitted = _with_heights(loaded.fitted(data), data)
         knows, start_ns = loaded.knows_standing, beside.start_ns
         given = beside.looks, beside.obstacles, config.evidence, fitted.estimator
         silence = hear_silence(*given, seen.named, start_ns, knows)
@@ -132,6 +133,14 @@ class Plan:
     def windows(self) -> MissionWindows:
         """What the tables speak of."""
         return self.seen.named if self.seen.associated is None else self.seen.associated.windows
+
+
+def _with_heights(fitted: Fitted, data: FittingData) -> Fitted:
+    """The estimator, and where detections have heights its hypotheses with heights beside them."""
+    if data.tracks.height_m is None:
+        return fitted
+    bank = data.fitted_heights()
+    return Fitted(HeightBeside(fitted.estimator, bank), {**fitted.about, "height": bank.about()})
 
 
 def _suspect(test: FitTest, config: InferConfig, suspicions: Suspicions) -> None:

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from cadence import metrics
+from cadence.arrays import Float32s
 from cadence.constraints.speed import needed_speed
 from cadence.evidence.estimator import CONTRADICTED, FEW_FIT
 from cadence.types import Detections, HypothesisSet
@@ -53,8 +54,16 @@ def hypothesis_rows(log_id: str, windows: MissionWindows, grid: Grid, part: Tens
         pa.array(windows.datum_m[which, 1]),
         pairs,
     ]
-    schema = hypotheses_schema(t)
+    if drawn.height_m is not None:
+        columns.append(_height_column(drawn.height_m[is_row].float().numpy()))
+    schema = hypotheses_schema(t, drawn.height_m is not None)
     return pa.Table.from_arrays([column.cast(item.type) for column, item in zip(columns, schema, strict=True)], schema=schema)
+
+
+def _height_column(height_m: Float32s) -> pa.Array:
+    """Heights [N, T] as a list a row; null where nothing is known."""
+    flat = pa.array(height_m.reshape(-1))
+    return pa.FixedSizeListArray.from_arrays(flat, height_m.shape[1], mask=pa.array(np.isnan(height_m).all(axis=1)))
 
 
 def window_rows(windows: MissionWindows, part: Tensor, drawn: HypothesisSet, max_speed_mps: float | None = None) -> pa.Table:

@@ -23,9 +23,11 @@ _POINTS = (f"{_FEATURES}.geometry.coordinates", '{geometry.type=="Point"}.geomet
 
 
 FIXES: Final[dict[str, MessageType]] = {
-    "NavSatFix": replace(geodetic("sensor_msgs.NavSatFix"), where=("status.status >= 0",)),
+    "NavSatFix": replace(geodetic("sensor_msgs.NavSatFix", vertical_datum="ellipsoid"), where=("status.status >= 0",)),
     "GPSFix": replace(
-        geodetic("gps_msgs.GPSFix"), schemas=("gps_msgs.GPSFix", "gps_common.GPSFix"), where=("status.status >= 0",)
+        geodetic("gps_msgs.GPSFix", vertical_datum="sea level"),
+        schemas=("gps_msgs.GPSFix", "gps_common.GPSFix"),
+        where=("status.status >= 0",),
     ),
     # As JSON it may say who was seen and who saw it: `cadence import` writes it so.
     "LocationFix": replace(geodetic("foxglove.LocationFix"), agent=("agent_id",), sensor=("sensor_id",)),
@@ -34,10 +36,10 @@ FIXES: Final[dict[str, MessageType]] = {
         time=tuple(f"fixes[:].{path}" for path in TIME_PATHS),
         frame_id=tuple(f"fixes[:].{path}" for path in FRAME_PATHS),
     ),
-    "GeoPointStamped": geodetic("geographic_msgs.GeoPointStamped", "position."),
-    "GeoPoseStamped": geodetic("geographic_msgs.GeoPoseStamped", "pose.position."),
+    "GeoPointStamped": geodetic("geographic_msgs.GeoPointStamped", "position.", vertical_datum="ellipsoid"),
+    "GeoPoseStamped": geodetic("geographic_msgs.GeoPoseStamped", "pose.position.", vertical_datum="ellipsoid"),
     "GeoPoseWithCovarianceStamped": replace(
-        geodetic("geographic_msgs.GeoPoseWithCovarianceStamped", "pose.pose.position."),
+        geodetic("geographic_msgs.GeoPoseWithCovarianceStamped", "pose.pose.position.", vertical_datum="ellipsoid"),
         covariance=("pose.covariance",),
         covariance_type=(),
         is_north_first=True,
@@ -47,6 +49,7 @@ FIXES: Final[dict[str, MessageType]] = {
         latitude=("lat.@div(1e7)",),
         longitude=("lon.@div(1e7)",),
         altitude=("h_msl.@div(1000)", "hMSL.@div(1000)", "height.@div(1000)"),
+        vertical_datum="sea level",
         sigma=("h_acc.@div(1000)", "hAcc.@div(1000)"),
         where=("flags & 1", "fix_type != 0", "fix_type != 5", "fixType != 0", "fixType != 5"),
     ),
@@ -55,6 +58,7 @@ FIXES: Final[dict[str, MessageType]] = {
         latitude=("lat.@div(1e7)",),
         longitude=("lon.@div(1e7)",),
         altitude=("alt.@div(1000)",),
+        vertical_datum="sea level",
         sigma=("h_acc.@div(1000)",),
         where=("fix_type >= 2",),
     ),
@@ -63,17 +67,22 @@ FIXES: Final[dict[str, MessageType]] = {
         latitude=("lat",),
         longitude=("lon",),
         altitude=("hgt",),
+        vertical_datum="sea level",
         sigma=("lat_stdev",),
         where=("sol_status.status == 0",),
     ),
     "SbgGpsPos": replace(
-        geodetic("sbg_driver.SbgGpsPos"), covariance=(), sigma=("position_accuracy.x",), where=("status.status == 0",)
+        geodetic("sbg_driver.SbgGpsPos", vertical_datum="sea level"),
+        covariance=(),
+        sigma=("position_accuracy.x",),
+        where=("status.status == 0",),
     ),
     "VehicleGlobalPosition": MessageType(
         ("px4_msgs.VehicleGlobalPosition", "px4_msgs.VehicleGlobalPositionGroundtruth"),
         latitude=("lat",),
         longitude=("lon",),
         altitude=("alt",),
+        vertical_datum="sea level",
         sigma=("eph",),
         where=("lat_lon_valid",),
     ),
@@ -82,6 +91,7 @@ FIXES: Final[dict[str, MessageType]] = {
         latitude=("latitude_deg", "lat.@div(1e7)"),
         longitude=("longitude_deg", "lon.@div(1e7)"),
         altitude=("altitude_msl_m", "alt.@div(1000)"),
+        vertical_datum="sea level",
         sigma=("eph",),
         where=("fix_type >= 2",),
         time=("time_utc_usec", *TIME_PATHS),
@@ -91,6 +101,7 @@ FIXES: Final[dict[str, MessageType]] = {
         latitude=("lat",),
         longitude=("lon",),
         altitude=("altitude",),
+        vertical_datum="sea level",
         where=("flags & 1",),
         agent=("icao_address",),
         role="detections",
@@ -101,6 +112,7 @@ FIXES: Final[dict[str, MessageType]] = {
         latitude=("latitude",),
         longitude=("longitude",),
         altitude=("altitude",),
+        vertical_datum="sea level",
         where=("flags & 1",),
         agent=("icao_address", "ICAO_address"),
         role="detections",
@@ -135,6 +147,7 @@ FIXES: Final[dict[str, MessageType]] = {
         latitude=tuple(f"{point}[1]" for point in _POINTS),
         longitude=tuple(f"{point}[0]" for point in _POINTS),
         altitude=tuple(f"{point}[2]" for point in _POINTS),
+        vertical_datum="ellipsoid",
         json_text="geojson",
         agent=tuple(
             f"{feature}{name}"

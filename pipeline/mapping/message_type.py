@@ -16,6 +16,10 @@ PATHS: Final = (
 """The fields of a message type that are message paths."""
 
 
+VerticalDatum = Literal["ellipsoid", "sea level", "ground", "start", "frame", "not stated"]
+"""What heights count from: the WGS 84 ellipsoid, mean sea level, the ground below, where it began, the zero of their frame."""
+
+
 @dataclass(frozen=True)
 class MessageType:
     """Message paths of one type: x and y (metres), or latitude and longitude (degrees); a message may lack all others.
@@ -29,6 +33,7 @@ class MessageType:
                      "all": every one of them holds positions of its own
     json_text        the field whose text is JSON, in which all paths begin
     frame_convention axes of x, y and z
+    vertical_datum   what z or altitude counts from, by the type's definition
     is_north_first   the covariance has y (north) before x (east)
     role             what such messages hold, whatever their topic is called; None: the topic tells
     names_agents     messages always have room for the identity of what was seen
@@ -54,6 +59,7 @@ class MessageType:
     alternatives: Literal["first", "filled", "all"] = "first"
     json_text: str = ""
     frame_convention: Literal["enu", "ned"] = "enu"
+    vertical_datum: VerticalDatum = "not stated"
     is_north_first: bool = False
     role: Literal["detections", "truth"] | None = None
     names_agents: bool = False
@@ -68,10 +74,10 @@ class MessageType:
 def metric(schema: str, *points: str) -> MessageType:
     """Positions in metres at alternative paths of something with x, y and z ("" for the message itself)."""
     x, y, z = (tuple(f"{point}.{axis}".lstrip(".") for point in points) for axis in "xyz")
-    return MessageType((schema,), x, y, z)
+    return MessageType((schema,), x, y, z, vertical_datum="frame")
 
 
-def geodetic(schema: str, point: str = "") -> MessageType:
+def geodetic(schema: str, point: str = "", vertical_datum: VerticalDatum = "not stated") -> MessageType:
     """Positions in degrees with the fields of a fix, in the field `point` of a message ("position.")."""
     return MessageType(
         (schema,),
@@ -80,6 +86,7 @@ def geodetic(schema: str, point: str = "") -> MessageType:
         altitude=(f"{point}altitude",),
         covariance=(f"{point}position_covariance",),
         covariance_type=(f"{point}position_covariance_type",),
+        vertical_datum=vertical_datum,
     )
 
 

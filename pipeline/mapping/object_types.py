@@ -93,6 +93,7 @@ OBJECTS: Final[dict[str, MessageType]] = {
         x=("objects[:].position[0]",),
         y=("objects[:].position[1]",),
         z=("objects[:].position[2]",),
+        vertical_datum="frame",
         covariance=("objects[:].position_covariance",),
         where=("objects[:].tracking_state != 2", "objects[:].tracking_state != 3"),
         agent=("objects[:].label_id",),

@@ -44,6 +44,7 @@ POSES: Final[dict[str, MessageType]] = {
         z=("position[2]", "z"),
         covariance=("position_variance", "pose_covariance"),
         frame_convention="ned",
+        vertical_datum="frame",
     ),
     # Motion capture.
     "RigidBodies": replace(

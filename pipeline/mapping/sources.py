@@ -8,7 +8,7 @@ from typing import Any, Literal, Protocol
 from cadence.errors import ConfigError
 from pipeline.mapping.conditions import parse_conditions
 from pipeline.mapping.message_path import parse_path
-from pipeline.mapping.message_type import PATHS, MessageType
+from pipeline.mapping.message_type import PATHS, MessageType, VerticalDatum
 from pipeline.mapping.message_types import MESSAGE_TYPES, type_of_schema
 
 PLACEHOLDERS = ("agent", "sensor")
@@ -23,6 +23,9 @@ _CHECKED = (
     "frame_id",
 )  # fmt: skip
 
+
+HeightUnit = Literal["m", "ft", "FL"]
+"""What z or altitude is in: metres, feet, or flight levels (hundreds of feet)."""
 
 Unit = Literal["deg", "rad", "1e-7 deg", "ddmm.mm", "m", "ecef"]
 """What latitude and longitude (the first four), or x, y and z, are in."""
@@ -63,6 +66,11 @@ class SourceConfig:
                 diagonal), x first, m²; where it is stated, what is read of a known type does not count
     sigma       message path of a standard deviation of x and y, in metres, where the message states no covariance
     sigma_m     standard deviation of x and y where the message states neither
+    height_unit of z or altitude: "m", "ft" or "FL" (hundreds of feet); default: metres, but for what
+                can hardly be meant as such
+    vertical_datum   what z or altitude counts from: "ellipsoid", "sea level", "ground", "start" or "frame" (the zero of its
+                frame); default: what the type's definition says, else "not stated"
+    sigma_z_m   standard deviation of z or altitude; default: the message's, else that of its own likelihood
     score       message path of a confidence
     time        message path of a stamp, or "log_time" or "publish_time"; default: the header's stamp, else the log time
     frame_id    message path of the frame's name; default: the header's
@@ -88,6 +96,9 @@ class SourceConfig:
     covariance: str | None = None
     sigma: str | None = None
     sigma_m: float | None = None
+    height_unit: HeightUnit | None = None
+    vertical_datum: VerticalDatum | None = None
+    sigma_z_m: float | None = None
     score: str | None = None
     time: str | None = None
     frame_id: str | None = None
@@ -102,8 +113,10 @@ class SourceConfig:
                 _check(name, self.without_topic(text), parse_path)
         if self.where:
             _check("where", self.where, parse_conditions)
-        if self.sigma_m is not None and not 0 < self.sigma_m < float("inf"):
-            raise ValueError(f"topic {self.topic!r}: sigma_m must be positive")
+        for name in ("sigma_m", "sigma_z_m"):
+            value = getattr(self, name)
+            if value is not None and not 0 < value < float("inf"):
+                raise ValueError(f"topic {self.topic!r}: {name} must be positive")
         self._check_position()
         self._check_identity()
 

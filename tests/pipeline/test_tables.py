@@ -1,12 +1,14 @@
 """Tables come back as they were written, with their frame; anything else is refused with one line."""
 
+import dataclasses
+
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
 from cadence.errors import InputError
 from pipeline.tables import Frame, read_table, write_table
-from schemas.tables import POSES, TRUTH, VERSION, hypotheses_schema
+from schemas.tables import DETECTIONS_WITH_HEIGHT, HEIGHT_VERSION, POSES, TRUTH, VERSION, hypotheses_schema
 
 FRAME = Frame("map", latitude_deg=50.25, longitude_deg=-1.5)
 
@@ -47,6 +49,18 @@ def test_hypotheses_keep_their_fixed_size(tmp_path):
     assert table.schema.equals(schema) and table.to_pylist() == [row]
 
 
+def test_tables_with_heights_are_version_two_and_name_what_heights_count_from(tmp_path):
+    frame = dataclasses.replace(FRAME, vertical_datum="sea level")
+    for name, schema in (("hypotheses", hypotheses_schema(3, True)), ("detections", DETECTIONS_WITH_HEIGHT)):
+        write_table(schema.empty_table(), tmp_path / name, name, frame)
+        assert pq.read_schema(tmp_path / name).metadata[b"cadence.version"] == b"2"
+        table, found = read_table(tmp_path / name, name)
+        assert table.schema.equals(schema) and found == frame
+    write_table(hypotheses_schema(3).empty_table(), tmp_path / "flat", "hypotheses", FRAME)
+    assert pq.read_schema(tmp_path / "flat").metadata[b"cadence.version"] == b"1"
+    assert b"vertical" not in pq.read_schema(tmp_path / "flat").metadata[b"cadence.frame"]
+
+
 def test_absent_file_says_which_stage(tmp_path):
     with pytest.raises(InputError, match="not found; run the stage"):
         read_table(tmp_path / "x.parquet", "truth")
@@ -57,8 +71,8 @@ def test_other_kind_or_version_is_refused(tmp_path, monkeypatch):
     write_table(truth_table(), path, "truth", FRAME)
     with pytest.raises(InputError, match=f"holds truth version {VERSION}, expected poses"):
         read_table(path, "poses")
-    monkeypatch.setattr("pipeline.tables.VERSION", VERSION + 1)
-    with pytest.raises(InputError, match=f"expected truth version {VERSION + 1}"):
+    monkeypatch.setattr("pipeline.tables.VERSION", HEIGHT_VERSION + 1)
+    with pytest.raises(InputError, match=f"expected truth version {HEIGHT_VERSION + 1}"):
         read_table(path, "truth")
 
 

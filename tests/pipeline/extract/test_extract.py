@@ -124,11 +124,11 @@ def test_georeferenced(tmp_path: Path) -> None:
     covariance = {"position_covariance": [225.0, 0, 0, 0, 100.0, 0, 0, 0, 1.0], "position_covariance_type": 2}
     rows = [fix(float(i), 50.0 + 0.001 * i, -1.0, **covariance) for i in range(3)]
     found = run(tmp_path, rows)
-    assert found.frame == Frame("mission", 50.001, -1.0)
+    assert found.frame == Frame("mission", 50.001, -1.0, "ellipsoid")
     np.testing.assert_allclose(found.detections["y_m"].to_numpy(), [-111.24, 0.0, 111.24], atol=0.02)
     np.testing.assert_allclose(found.detections["x_m"].to_numpy(), 0.0, atol=1e-6)
     assert found.detections["cov_xx_m2"].to_pylist() == [225.0] * 3 and found.detections["cov_yy_m2"].to_pylist() == [100.0] * 3
-    assert run(tmp_path, rows, datum=[50.0, -1.0]).frame == Frame("mission", 50.0, -1.0)
+    assert run(tmp_path, rows, datum=[50.0, -1.0]).frame == Frame("mission", 50.0, -1.0, "ellipsoid")
 
 
 def test_no_fix_is_skipped(tmp_path: Path) -> None:
