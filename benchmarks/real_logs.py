@@ -197,7 +197,7 @@ def run_setting(setting: Setting, options: argparse.Namespace, progress: Progres
     max_gap_s = default_truth_gap_s(truth, grid.step_s)
     truth_m, is_known = truth_on_grid(truth, windows, max_gap_s)
     data = FittingData.of(detections, grid, windows)
-    some = _spread(windows.batch.is_active, options.most_tracks)
+    some = evenly_spread(windows.batch.is_active, options.most_tracks)
     asked = windows.batch[some], truth_m[some], is_known[some], num_hypotheses
     for name in missing:
         begin = time.perf_counter()
@@ -306,7 +306,7 @@ def _windows(results: Sequence[Result]) -> list[publishing.Row]:
     return rows
 
 
-def _spread(is_active: Tensor, most_tracks: int) -> Tensor:
+def evenly_spread(is_active: Tensor, most_tracks: int) -> Tensor:
     """Windows [b], evenly spread, that hold about `most_tracks` tracks, of those that hold any; all where they are fewer."""
     used = is_active.any(1).nonzero()[:, 0]
     num = max(1, round(most_tracks / max(1.0, float(is_active[used].sum(1).double().mean()))))

@@ -30,6 +30,10 @@ _DROP: Final = 1.92
 _MODEL_ERROR: Final = 0.1
 """Modes are not quite those of real targets: simulated noise comes out up to so much too small."""
 _MIN_CHANGES: Final = 8
+_MIN_STEPS: Final = 2
+_NUM_STEPS: Final = 6
+"""Of the smallest changes, those that are tried: now and then one altimeter of many states finer steps."""
+_MOST_MULTIPLE: Final = 20.0
 _MOST: Final = 0.95
 _EXACT: Final = 0.02
 """So many heights must change so often, by whole multiples of one step up to this share of it, to be called rounded."""
@@ -69,17 +73,26 @@ def height_noise(tracks: Sequence[HeightTrack]) -> HeightNoise | None:
 
 
 def rounding_m(tracks: Sequence[HeightTrack]) -> float:
-    """The step of which nearly all changes of height are multiples; 0 where there is none."""
+    """The largest step of which nearly all changes of height are multiples; 0 where there is none."""
     change = np.abs(np.concatenate([np.diff(track.height_m) for track in tracks]))
-    change = change[change > 1e-9]
+    change = change[change > 1e-6]
     if len(change) < _MIN_CHANGES:
         return 0.0
-    step_m = float(np.quantile(change, 0.01))
-    multiple = change / step_m
-    is_whole = np.abs(multiple - np.round(multiple)) <= _EXACT * np.maximum(1.0, multiple / 50.0)
-    # of small multiples only: of large ones any number is near to one
-    is_telling = multiple < 10.0
-    return step_m if is_telling.sum() >= _MIN_CHANGES and is_whole[is_telling].mean() >= _MOST else 0.0
+    return max(
+        (step_m for step_m in np.unique(np.round(change, 3))[:_NUM_STEPS].tolist() if _is_step(step_m, change)), default=0.0
+    )
+
+
+def _is_step(step_m: float, change_m: Float64s) -> bool:
+    """Whether changes are whole multiples of a step; of small multiples only, as any large number is near to one."""
+    multiple = change_m / step_m
+    is_whole = np.abs(multiple - np.round(multiple)) <= _EXACT
+    is_telling = multiple < _MOST_MULTIPLE
+    return bool(
+        is_telling.sum() >= _MIN_CHANGES
+        and is_whole[is_telling].mean() >= _MOST
+        and (np.round(multiple) == 1).sum() >= _MIN_STEPS
+    )
 
 
 def _stretches(tracks: Sequence[HeightTrack]) -> list[HeightTrack]:

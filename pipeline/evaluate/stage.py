@@ -154,8 +154,9 @@ def score_mission(directory: Path, config: EvaluateConfig, progress: Progress) -
             scorer, motion, on_map = _scorer(case), truth.fresh(), maps.fresh()
             watched = on_map.watch(motion.watch(scorer.watch(draw) if case.is_joint else draw))
             cells = score_in_chunks(
-                watched, scored, case.truth_m, is_known, num_hypotheses, collides, bar.update, truth.fastest_m
-            )
+                watched, scored, case.truth_m, is_known, num_hypotheses, collides, bar.update, truth.fastest_m,
+                truth_height_m=case.truth_height_m,
+            )  # fmt: skip
             mapped[name] = on_map.cells()
             return cells, scorer.cells(), motion.laws()
 

@@ -28,6 +28,8 @@ _PART_METRICS = {
     "min_ade_m": "minADE m", "mean_error_m": "error of mean m", "coverage_50": "in 50 %", "coverage_90": "in 90 %",
     "spread_m": "spread m", "step_length_m": "step m", "true_step_length_m": "true step m", "collision_share": "collisions",
     "map_score": "MapScore",
+    "height_energy_score_m": "height energy m", "height_coverage_90": "height in 90 %", "energy_score_3d_m": "energy 3-D m",
+    "coverage_90_3d": "in 90 % 3-D",
 }  # fmt: skip
 _MOTION_TITLES = {
     "speed_w1_mps": "speed m/s", "acceleration_w1_mps2": "acceleration m/s²", "turn_w1_deg": "turn a step °",

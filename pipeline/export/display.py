@@ -10,7 +10,7 @@ import numpy as np
 
 from cadence.arrays import Bools, Float64s, Int64s
 from pipeline.export import numbers
-from pipeline.export.playback import LiveAgent, Scene
+from pipeline.export.playback import HEIGHT_COUNTS, LiveAgent, Scene
 from pipeline.export.scene import Entity, Label, Lines, LineType, Spheres, round_positions
 from pipeline.export.sizes import reach_m
 from pipeline.export.vertices import visible_vertices
@@ -50,11 +50,15 @@ def agent_hue(index: int) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Marks:
-    """Detections of one agent, sorted: time_ns [N], position_m [N, 2] in the mission frame."""
+    """Detections of one agent, sorted: time_ns [N], position_m [N, 2] in the mission frame.
+
+    height_m  [N] NaN where unknown; None where heights are not used
+    """
 
     agent_id: str
     time_ns: Int64s
     position_m: Float64s
+    height_m: Float64s | None = None
 
 
 @dataclass(frozen=True)
@@ -66,6 +70,8 @@ class Style:
     plotted_ids         agents with hypotheses, those detected most first: the order in which plots take them
     named_ids           agents whose detections say whose they are
     uncertain_ids       agents that may not be there at all: the log does not say whose its detections are
+    z_m                 height of what has none of its own: the mean of all detections, or the lowest where heights are used
+    high_ids            agents whose hypotheses have heights
     """
 
     agent_ids: tuple[str, ...]
@@ -78,6 +84,7 @@ class Style:
     plotted_ids: tuple[str, ...] = ()
     named_ids: frozenset[str] = frozenset()
     uncertain_ids: frozenset[str] = frozenset()
+    high_ids: frozenset[str] = frozenset()
 
     def hue(self, agent_id: str) -> str:
         """The colour of an agent as #RRGGBB; grey for one that was never inferred."""
@@ -94,10 +101,13 @@ class Style:
             return self.mark_m[agent_id]
         return float(np.median(list(self.mark_m.values()))) if self.mark_m else 0.005 * self.extent_m
 
-    def place(self, position_m: Float64s, reach_m: float) -> Float64s:
-        """Positions [..., 2] rounded for the eye, as part of a drawing so wide, with the height of the scene [..., 3]."""
+    def place(self, position_m: Float64s, reach_m: float, height_m: Float64s | None = None) -> Float64s:
+        """Positions [..., 2] rounded for the eye, as part of a drawing so wide, with their height or the scene's [..., 3]."""
         flat = round_positions(position_m, reach_m)
-        return np.concatenate([flat, np.full((*flat.shape[:-1], 1), self.z_m)], axis=-1)
+        if height_m is None:
+            return np.concatenate([flat, np.full((*flat.shape[:-1], 1), self.z_m)], axis=-1)
+        known_m = np.where(np.isnan(height_m), self.z_m, height_m)
+        return np.concatenate([flat, round_positions(known_m, reach_m / HEIGHT_COUNTS)[..., None]], axis=-1)
 
 
 def hypothesis_entities(scene: Scene, marks: Sequence[Marks], style: Style) -> list[Entity]:
@@ -120,7 +130,8 @@ def _detections(marks: Sequence[Marks], start_ns: int, end_ns: int, style: Style
         first = max(first, last - _MAX_MARKS)
         if first < last:
             size_m = 0.5 * style.size_m(found.agent_id)
-            place_m = style.place(found.position_m[first:last], 256.0 * size_m)
+            height_m = None if found.height_m is None else found.height_m[first:last]
+            place_m = style.place(found.position_m[first:last], 256.0 * size_m, height_m)
             entities.append(
                 Entity(f"detections/{found.agent_id}", spheres=(Spheres(place_m, size_m, style.color(found.agent_id)),))
             )
@@ -130,8 +141,8 @@ def _detections(marks: Sequence[Marks], start_ns: int, end_ns: int, style: Style
 def _ball(live: LiveAgent, time_ns: int, style: Style) -> Entity:
     """A ball about where the central hypothesis is now, as wide as the hypotheses lie apart, within limits."""
     size_m, color = style.size_m(live.agent.agent_id), style.color(live.agent.agent_id)
-    now_m = live.at(time_ns)
-    place_m = style.place(now_m[live.central], 256.0 * size_m)
+    now_m, height_m = live.at(time_ns), live.height_at(time_ns)
+    place_m = style.place(now_m[live.central], 256.0 * size_m, None if height_m is None else height_m[live.central])
     wide_m = float(np.clip(2.0 * numbers.spread_m(now_m, live.weight), size_m, _LARGEST_BALL * size_m))
     called = with_presence(live.agent.agent_id, live.agent.probability)
     return Entity(
@@ -146,9 +157,11 @@ def _hypothesis_lines(live: LiveAgent, style: Style) -> tuple[Lines, ...]:
     # The heaviest ones; the order of drawing stays that of their numbers.
     chosen = np.sort(np.argsort(-live.weight, kind="stable")[: style.num_hypotheses])
     alpha = _ALPHA_FLOOR + (_ALPHA_TOP - _ALPHA_FLOOR) * live.weight[chosen] / live.weight[chosen].max()
-    track_m = live.position_m[[*chosen, live.central]]
-    is_vertex = _vertices(track_m, live.window.origin_index, style.max_vertices)
-    place_m, groups = style.place(track_m, reach_m(live)), []
+    drawn = [*chosen, live.central]
+    track_m, height_m = live.position_m[drawn], None if live.height_m is None else live.height_m[drawn]
+    seen_m = track_m if height_m is None else np.concatenate([track_m, HEIGHT_COUNTS * height_m[..., None]], axis=-1)
+    is_vertex = _vertices(seen_m, live.window.origin_index, style.max_vertices)
+    place_m, groups = style.place(track_m, reach_m(live), height_m), []
     for is_future, steps in enumerate((slice(None, live.window.origin_index + 1), slice(live.window.origin_index, None))):
         hue = style.color(live.agent.agent_id)[:3]
         hue = hue + is_future * _FUTURE_TINT * (1.0 - hue)
@@ -161,7 +174,7 @@ def _hypothesis_lines(live: LiveAgent, style: Style) -> tuple[Lines, ...]:
 
 
 def _vertices(track_m: Float64s, origin_index: int, max_vertices: int) -> Bools:
-    """Steps [K, T] at which lines have points: as few as nobody can tell, and no more than `max_vertices` in the mean."""
+    """Steps [K, T] at which lines [K, T, D] have points: as few as nobody can tell, and `max_vertices` in the mean at most."""
     tolerance_m = _SEEN_SHARE * max(float(np.ptp(track_m, axis=(0, 1)).max()), 1e-3)
     while True:
         is_vertex = visible_vertices(track_m, origin_index, tolerance_m)

@@ -109,6 +109,7 @@ def _columns(
     if frame.is_georeferenced:
         left += (_Panel("Map", "map", "Map", _map_config(style, source, topics), 1.0),)
     plots = [("Spread (m)", _spread_series), ("Detections", _detection_series)]
+    plots += [("Height (m)", _height_series)] if style.high_ids else []
     plots += [("Association", _association_series)] if style.uncertain_ids else []
     few = f", {MAX_PLOTTED} of {len(style.plotted_ids)} agents" if len(style.plotted_ids) > MAX_PLOTTED else ""
     right: tuple[_Panel, ...] = tuple(
@@ -201,6 +202,16 @@ def _detection_series(style: Style) -> Iterable[Json]:
         if agent_id in style.named_ids:
             detection = f"{channels.DETECTIONS.topic}{_filter('agent_id', agent_id)}.num_merged"
             yield _series(style, agent_id, detection, "detected", line_size=3) | {"showLine": False}
+
+
+def _height_series(style: Style) -> Iterable[Json]:
+    """The mean height of each agent, and the heights at which it was detected as points."""
+    for agent_id, agent in _plotted(style):
+        if agent_id in style.high_ids:
+            yield _series(style, agent_id, f"{agent}.height_m", "height", line_size=2)
+            if agent_id in style.named_ids:
+                detection = f"{channels.DETECTIONS.topic}{_filter('agent_id', agent_id)}.z_m"
+                yield _series(style, agent_id, detection, "detected", line_size=3) | {"showLine": False}
 
 
 def _association_series(style: Style) -> Iterable[Json]:

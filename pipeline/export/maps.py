@@ -42,8 +42,14 @@ class MovingFixes:
             if last_scene is not scene or np.linalg.norm(mean_m - last_m) > 0.5 * self._style.size_m(agent_id):
                 self._shown[agent_id] = scene, mean_m
                 covariance = numbers.covariance_m2(live.at(now_ns), live.weight)
-                color, z_m = self._style.color(agent_id), self._style.z_m
-                yield agent_id, _encode_fix(mean_m, z_m, covariance, self._frame, color, time_ns, _APPROXIMATED)
+                color, z_m, variance_m2 = self._style.color(agent_id), self._style.z_m, 0.0
+                height_m = live.height_at(now_ns)
+                if height_m is not None:
+                    z_m, variance_m2 = float(live.weight @ height_m), numbers.spread_m(height_m[:, None], live.weight) ** 2
+                yield (
+                    agent_id,
+                    _encode_fix(mean_m, z_m, covariance, self._frame, color, time_ns, _APPROXIMATED, variance_m2),
+                )
 
 
 def encode_detection_fix(row: dict[str, Any], frame: Frame, style: Style, time_ns: int) -> bytes:
@@ -53,12 +59,14 @@ def encode_detection_fix(row: dict[str, Any], frame: Frame, style: Style, time_n
     covariance = np.array([[xx, xy or 0.0], [xy or 0.0, yy]]) if is_known else None
     position_m, z_m = np.array([row["x_m"], row["y_m"]]), row["z_m"] if row["z_m"] is not None else style.z_m
     color = style.color(row["agent_id"] or UNKNOWN_AGENT)
-    return _encode_fix(position_m, z_m, covariance, frame, color, time_ns, _KNOWN if is_known else 0)
+    kind = _KNOWN if is_known else 0
+    return _encode_fix(position_m, z_m, covariance, frame, color, time_ns, kind, row.get("cov_zz_m2") or 0.0)
 
 
 def _encode_fix(
-    position_m: Float64s, z_m: float, covariance: Float64s | None, frame: Frame, color: Float64s, time_ns: int, kind: int
-) -> bytes:
+    position_m: Float64s, z_m: float, covariance: Float64s | None, frame: Frame, color: Float64s, time_ns: int, kind: int,
+    height_variance_m2: float,
+) -> bytes:  # fmt: skip
     latitude, longitude = to_geodetic(frame, position_m[:1], position_m[1:])
     message = foxglove_class("foxglove.LocationFix")(
         frame_id=frame.frame_id,
@@ -69,7 +77,7 @@ def _encode_fix(
     )
     if covariance is not None:
         (xx, xy), (_, yy) = covariance.tolist()
-        message.position_covariance.extend([xx, xy, 0.0, xy, yy, 0.0, 0.0, 0.0, 0.0])
+        message.position_covariance.extend([xx, xy, 0.0, xy, yy, 0.0, 0.0, 0.0, height_variance_m2])
     message.timestamp.FromNanoseconds(time_ns)
     if "color" in message.DESCRIPTOR.fields_by_name:
         message.color.r, message.color.g, message.color.b, message.color.a = color
@@ -96,7 +104,8 @@ def plan_map(ticks: Sequence[Tick], period_s: float | None) -> dict[int, int]:
 def encode_map(scene: Scene, start_ns: int, frame: Frame, style: Style) -> bytes:
     """foxglove.GeoJSON: for every live agent its mean track between a time and the origin, and the regions around it.
 
-    They hold 90 % and 50 % at each step. What lies after the origin is left to what moves: viewers draw all of a file's
+    They hold 90 % and 50 % at each step; where heights are known the line has them, and the regions say between which they lie.
+    What lies after the origin is left to what moves: viewers draw all of a file's
     GeoJSON at once, whatever the time.
     """
     features = []
@@ -106,13 +115,28 @@ def encode_map(scene: Scene, start_ns: int, frame: Frame, style: Style) -> bytes
         steps = _steps(live, start_ns)
         for share in _SHARES:
             style_90 = {"color": hue, "weight": 1, "opacity": 0.6, "fillColor": hue, "fillOpacity": 0.25 - 0.15 * share}
-            features.append(_feature(_region(live, steps, share), frame, f"{name} {share:.0%}", style_90))
+            region = _feature(_region(live, steps, share), frame, f"{name} {share:.0%}", style_90)
+            region["properties"] |= _heights(live, steps, share)
+            features.append(region)
         if len(steps) > 1:
             mean = {"color": hue, "weight": 3, "opacity": 1.0}
-            features.append(_feature(shapely.LineString(live.mean_m[steps]), frame, f"{name} mean", mean))
+            line = _feature(shapely.LineString(live.mean_m[steps]), frame, f"{name} mean", mean)
+            if live.height_m is not None:
+                mean_m = np.round(live.weight @ live.height_m[:, steps], 1).tolist()
+                points = zip(line["geometry"]["coordinates"], mean_m, strict=True)
+                line["geometry"]["coordinates"] = [[*point, height_m] for point, height_m in points]
+            features.append(line)
     text = json.dumps({"type": "FeatureCollection", "features": features}, separators=(",", ":"), ensure_ascii=False)
     data: bytes = foxglove_class("foxglove.GeoJSON")(geojson=text).SerializeToString()
     return data
+
+
+def _heights(live: LiveAgent, steps: Indices, share: float) -> dict[str, list[float]]:
+    """Between which heights `share` of the weight lies at every one of the steps, least and greatest of all; or nothing."""
+    if live.height_m is None:
+        return {}
+    ends = [numbers.weighted_quantile(live.height_m[:, steps], live.weight, 0.5 + side * share / 2) for side in (-1, 1)]
+    return {"height_m": [round(float(ends[0].min()), 1), round(float(ends[1].max()), 1)]}
 
 
 def _region(live: LiveAgent, steps: Indices, share: float) -> BaseGeometry:

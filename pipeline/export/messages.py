@@ -36,6 +36,7 @@ def encode_hypotheses(window: WindowHypotheses, frame: Frame, time_ns: int) -> b
         weight=window.weight.tolist(),
         latitude_deg=frame.latitude_deg,
         longitude_deg=frame.longitude_deg,
+        vertical_datum=frame.vertical_datum,
     )
     head.timestamp.FromNanoseconds(time_ns)
     # Fields may come in any order. A packed field is its bytes: no number passes through Python.
@@ -57,7 +58,9 @@ def _encode_agent(agent: AgentHypotheses) -> bytes:
         num_effective=agent.num_effective,
     )
     position: bytes = np.ascontiguousarray(agent.position_m, dtype="<f4").tobytes()
-    return bytes(head.SerializeToString()) + (field(9, position) if position else b"")
+    height = b"" if agent.height_m is None else np.ascontiguousarray(agent.height_m, dtype="<f4").tobytes()
+    fields = [field(number, data) for number, data in ((9, position), (13, height)) if data]
+    return b"".join([bytes(head.SerializeToString()), *fields])
 
 
 def encode_agents(tick: Tick, time_ns: int) -> bytes:
@@ -83,6 +86,10 @@ def _add_state(state: Any, live: LiveAgent, now_ns: int) -> None:
     state.speed_mps = _to_plot(live.speed_mps(now_ns))
     state.entropy = _to_plot(numbers.weight_entropy(live.weight))
     state.num_modes = live.num_modes
+    height_m = live.height_at(now_ns)
+    if height_m is not None:
+        state.height_m = _to_plot(float(live.weight @ height_m))
+        state.height_spread_m = _to_plot(numbers.spread_m(height_m[:, None], live.weight))
     for name in ("probability", "association_entropy_bits", "num_effective"):
         if getattr(agent, name) is not None:
             setattr(state, name, getattr(agent, name))
@@ -100,9 +107,10 @@ def encode_detection(row: dict[str, Any], frame: Frame, time_ns: int, sources: S
     for name in ("agent_id", "sensor_id", "x_m", "y_m", "num_merged", "topic", "log_time_ns", "sequence"):
         if row[name] is not None:
             setattr(message, name, row[name])
-    for name in ("z_m", "cov_xx_m2", "cov_xy_m2", "cov_yy_m2", "score"):
-        if row[name] is not None and math.isfinite(row[name]):
-            setattr(message, name, row[name])
+    for name in ("z_m", "cov_xx_m2", "cov_xy_m2", "cov_yy_m2", "cov_zz_m2", "score"):
+        value = row.get(name)
+        if value is not None and math.isfinite(value):
+            setattr(message, name, value)
     if sources:
         _add_association(message.association, sources)
     data: bytes = message.SerializeToString()

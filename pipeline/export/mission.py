@@ -119,8 +119,12 @@ def _marks(detections: pa.Table) -> tuple[Marks, ...]:
     time_ns = detections["time_ns"].to_numpy()
     position_m = _positions(detections)
     usable = np.isfinite(position_m).all(axis=-1)
-    ids = sorted(set(agent.tolist()))
-    return tuple(Marks(name, time_ns[(agent == name) & usable], position_m[(agent == name) & usable]) for name in ids)
+    height_m = detections["z_m"].to_numpy().astype(np.float64) if "cov_zz_m2" in detections.column_names else None
+    found = []
+    for name in sorted(set(agent.tolist())):
+        own = (agent == name) & usable
+        found.append(Marks(name, time_ns[own], position_m[own], None if height_m is None else height_m[own]))
+    return tuple(found)
 
 
 def _style(hypotheses: MissionHypotheses, scenes: list[Scene], detections: pa.Table, config: ExportConfig) -> Style:
@@ -130,6 +134,7 @@ def _style(hypotheses: MissionHypotheses, scenes: list[Scene], detections: pa.Ta
     center_m, extent_m = corners.mean(axis=0), max(float(np.max(corners[1] - corners[0])), 1.0)
     z_m = detections["z_m"].to_numpy().astype(np.float64)
     z_m = z_m[np.isfinite(z_m)]
+    has_height = "cov_zz_m2" in detections.column_names
     live = [one.agent for scene in scenes for one in scene.live]
     num_seen = Counter({agent.agent_id: 0 for agent in live})
     for agent in live:
@@ -138,13 +143,14 @@ def _style(hypotheses: MissionHypotheses, scenes: list[Scene], detections: pa.Ta
         agent_ids=hypotheses.agent_ids,
         center_m=(float(center_m[0]), float(center_m[1])),
         extent_m=extent_m,
-        z_m=round(float(z_m.mean()), 1) if len(z_m) else 0.0,
+        z_m=round(float(z_m.min() if has_height else z_m.mean()), 1) if len(z_m) else 0.0,
         num_hypotheses=config.num_scene_hypotheses,
         max_vertices=num_vertices(scenes, config),
         mark_m=mark_sizes_m(scenes, _sigma_m(detections), extent_m),
         plotted_ids=tuple(sorted(num_seen, key=lambda agent_id: (-num_seen[agent_id], agent_id))),
         named_ids=frozenset(pc.unique(detections["agent_id"]).drop_null().to_pylist()),
         uncertain_ids=frozenset(agent.agent_id for agent in live if agent.probability is not None),
+        high_ids=frozenset(agent.agent_id for agent in live if agent.height_m is not None),
     )
 
 

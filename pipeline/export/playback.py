@@ -12,6 +12,9 @@ from cadence.arrays import Float64s, Indices
 from pipeline.export import numbers
 from pipeline.results import AgentHypotheses, MissionHypotheses, WindowHypotheses
 
+HEIGHT_COUNTS = 4.0
+"""So much more than a metre in the plane a metre of height counts: heights reach less far, and are looked at from the side."""
+
 _MOST_COMPARED = 64
 """Hypotheses among which the central one is sought, the heaviest first: the work grows as their square."""
 
@@ -20,7 +23,7 @@ _MOST_COMPARED = 64
 class LiveAgent:
     """One agent of one window, ready to be drawn: positions in the mission frame, without hypotheses that are not finite.
 
-    hypothesis [K] row in the window, weight [K] sums to one, position_m [K, T, 2] float64.
+    hypothesis [K] row in the window, weight [K] sums to one, position_m [K, T, 2] float64; height_m [K, T] where it is known.
     """
 
     agent: AgentHypotheses
@@ -28,6 +31,7 @@ class LiveAgent:
     hypothesis: Indices
     weight: Float64s
     position_m: Float64s
+    height_m: Float64s | None = None
 
     @cached_property
     def mean_m(self) -> Float64s:
@@ -39,6 +43,8 @@ class LiveAgent:
         """The hypothesis nearest to all others, over all steps: unlike the mean it is a track that somebody can have taken."""
         few = np.argsort(-self.weight, kind="stable")[:_MOST_COMPARED]
         track_m = self.position_m[few]
+        if self.height_m is not None:
+            track_m = np.concatenate([track_m, HEIGHT_COUNTS * self.height_m[few][..., None]], axis=-1)
         away_m = np.array([np.linalg.norm(track_m - one, axis=-1).mean(axis=-1) @ self.weight[few] for one in track_m])
         return int(few[away_m.argmin()])
 
@@ -63,11 +69,18 @@ class LiveAgent:
 
     def at(self, time_ns: int) -> Float64s:
         """Positions [K, 2] at a time: linear between steps, the first or last step outside of them."""
+        return self._between_steps(self.position_m, time_ns)
+
+    def height_at(self, time_ns: int) -> Float64s | None:
+        """Heights [K] at a time, as positions; None where they are unknown."""
+        return None if self.height_m is None else self._between_steps(self.height_m, time_ns)
+
+    def _between_steps(self, values: Float64s, time_ns: int) -> Float64s:
         steps = self.window.origin_index + (time_ns - self.window.origin_ns) / self.window.step_ns
         low = int(np.clip(np.floor(steps), 0, max(self.window.num_steps - 2, 0)))
         high = min(low + 1, self.window.num_steps - 1)
         share = float(np.clip(steps - low, 0.0, 1.0))
-        return np.asarray((1.0 - share) * self.position_m[:, low] + share * self.position_m[:, high])
+        return np.asarray((1.0 - share) * values[:, low] + share * values[:, high])
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,4 +158,6 @@ def _live(window: WindowHypotheses, agent: AgentHypotheses) -> LiveAgent:
     if not weight.sum() > 0:
         weight = np.ones(len(kept))
     share = np.asarray(weight / max(float(weight.sum()), 1e-300))
-    return LiveAgent(agent, window, kept, share, agent.position_m[kept].astype(np.float64) + agent.datum_m)
+    position_m = agent.position_m[kept].astype(np.float64) + agent.datum_m
+    height_m = None if agent.height_m is None else agent.height_m[kept].astype(np.float64)
+    return LiveAgent(agent, window, kept, share, position_m, height_m)

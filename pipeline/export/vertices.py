@@ -6,13 +6,13 @@ from cadence.arrays import Bools, Float64s
 
 
 def visible_vertices(track_m: Float64s, origin_index: int, tolerance_m: float) -> Bools:
-    """Which steps [K, T] of tracks [K, T, 2] need a point so that no step lies farther from its line than the tolerance.
+    """Which steps [K, T] of tracks [K, T, 2 or 3] need a point so that no step lies farther from its line than the tolerance.
 
     The ends and the origin always do. After Douglas and Peucker (1973), "Algorithms for the reduction of the number of points
     required to represent a digitized line or its caricature"; every stretch of every track is halved at once.
     """
     num_tracks, num_steps = track_m.shape[:2]
-    point_m = track_m.reshape(-1, 2)
+    point_m = track_m.reshape(-1, track_m.shape[-1])
     is_kept = np.zeros((num_tracks, num_steps), dtype=bool)
     is_kept[:, [0, origin_index, -1]] = True
     flat = is_kept.reshape(-1)
@@ -29,9 +29,10 @@ def visible_vertices(track_m: Float64s, origin_index: int, tolerance_m: float) -
 
 
 def _distance_m(point_m: Float64s, begin_m: Float64s, end_m: Float64s) -> Float64s:
-    """Of points [N, 2] to straight pieces between two points each [N, 2]."""
+    """Of points [N, D] to straight pieces between two points each [N, D]."""
     chord_m, from_begin_m = end_m - begin_m, point_m - begin_m
     length_m2 = np.maximum(np.einsum("nd,nd->n", chord_m, chord_m), 1e-300)
     share = np.clip(np.einsum("nd,nd->n", from_begin_m, chord_m) / length_m2, 0.0, 1.0)
     apart_m = from_begin_m - share[:, None] * chord_m
-    return np.asarray(np.hypot(apart_m[:, 0], apart_m[:, 1]))
+    flat_m = np.hypot(apart_m[:, 0], apart_m[:, 1])
+    return np.asarray(flat_m if apart_m.shape[1] == 2 else np.hypot(flat_m, apart_m[:, 2]))

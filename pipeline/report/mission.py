@@ -44,16 +44,19 @@ class Points:
     """Timed positions with an owner: detections and truth of agents, poses of sensors; sorted by time.
 
     time_ns [N], owner [N] index into the names that belong to it (-1: unknown), position_m [N, 2]
+    height_m [N]  of detections, NaN where unknown; None where heights are not used
     """
 
     time_ns: Int64s
     owner: Int64s
     position_m: Float64s
+    height_m: Float64s | None = None
 
     def of(self, owner: int) -> "Points":
         """The points of one owner."""
         chosen = self.owner == owner
-        return Points(self.time_ns[chosen], self.owner[chosen], self.position_m[chosen])
+        height_m = None if self.height_m is None else self.height_m[chosen]
+        return Points(self.time_ns[chosen], self.owner[chosen], self.position_m[chosen], height_m)
 
     def between(self, start_ns: int, end_ns: int) -> "Points":
         """The points with start_ns <= time_ns <= end_ns."""
@@ -306,7 +309,8 @@ def _points(table: pa.Table, column: str, names: tuple[str, ...], stand_in: str 
     owner = _index(table[column] if stand_in is None else table[column].fill_null(stand_in), names)
     usable = np.isfinite(position_m).all(axis=1)
     order = np.argsort(time_ns[usable], kind="stable")
-    return Points(time_ns[usable][order], owner[usable][order], position_m[usable][order])
+    height_m = table["z_m"].to_numpy().astype(np.float64)[usable][order] if "cov_zz_m2" in table.column_names else None
+    return Points(time_ns[usable][order], owner[usable][order], position_m[usable][order], height_m)
 
 
 def _window_rows(found: MissionHypotheses, agents: tuple[str, ...]) -> tuple[WindowRow, ...]:

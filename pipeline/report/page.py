@@ -11,6 +11,7 @@ from pipeline.clock import Clock, duration
 from pipeline.report.analysis import Analysis, Moment, share_of_steps
 from pipeline.report.answers import answers_section
 from pipeline.report.health import health_section
+from pipeline.report.heights import height_section
 from pipeline.report.markup import inline_json, legend, pairs, section, text
 from pipeline.report.mission import Mission
 from pipeline.report.origins import origins_section
@@ -85,6 +86,7 @@ def write_page(mission: Mission, analysis: Analysis, payload: Payload, moments: 
         origins_section(mission.origins, mission.start_ns, mission.end_ns, presence, mission.num_tracked, _stream(mission)),
         silence_section(mission),
         uncertainty_section(mission, analysis),
+        height_section(mission),
         truth_section(mission, analysis),
         trouble_section(mission),
         health_section(mission),

@@ -23,7 +23,7 @@ from pipeline.scoring.matching import match_to_truth, matched, matched_windows
 from pipeline.scoring.scores import IsInside
 from pipeline.tables import read_table
 from pipeline.tracks import UNKNOWN_AGENT
-from pipeline.windows import MissionWindows, build_windows, truth_on_grid
+from pipeline.windows import MissionWindows, build_windows, heights_on_grid, truth_on_grid
 
 LABELS_NAME = "labels.parquet"
 _TRUTH_GAP_STEPS = 2.0
@@ -42,6 +42,7 @@ class Case:
     names       of the J agents of the truth that are compared; match [B, J] which of the A each one is, -1: none
     is_matched  whether they had to be matched, as the origin of detections is unknown
     truth_m     [B, J, T, 2] about the datum, is_known [B, J, T]
+    truth_height_m  [B, J, T] NaN where unknown; None where hypotheses have no heights
     """
 
     stored: MissionHypotheses
@@ -57,6 +58,7 @@ class Case:
     is_known: Tensor
     max_truth_gap_s: float
     cutoff_m: float
+    truth_height_m: Tensor | None = None
 
     @cached_property
     def scored(self) -> WindowBatch:
@@ -112,8 +114,24 @@ def read_case(
     if is_matched:
         match = match_to_truth(windows, truth, names, max_gap_s, cutoff_m)
     is_counted = _is_counted(stored, windows.agent_ids)
+    truth_height_m = None
+    if any(agent.height_m is not None for window in stored.windows for agent in window.agents):
+        truth_height_m = heights_on_grid(truth, replace(windows, agent_ids=names), max_gap_s)
     return Case(
-        stored, grid, sigma_m, detections, windows, is_counted, names, match, is_matched, truth_m, is_known, max_gap_s, cutoff_m
+        stored,
+        grid,
+        sigma_m,
+        detections,
+        windows,
+        is_counted,
+        names,
+        match,
+        is_matched,
+        truth_m,
+        is_known,
+        max_gap_s,
+        cutoff_m,
+        truth_height_m,
     )
 
 
@@ -229,6 +247,8 @@ def _stored_hypotheses(stored: MissionHypotheses, windows: MissionWindows, index
     """Hypotheses of some windows as one set; a window with fewer of them is filled up with weight zero."""
     shape = (len(index), num_hypotheses, len(windows.agent_ids), windows.batch.num_steps, 2)
     position = np.full(shape, np.nan)
+    has_height = any(agent.height_m is not None for b in index.tolist() for agent in stored.windows[b].agents)
+    height = np.full(shape[:-1], np.nan) if has_height else None
     weight = np.zeros(shape[:2])
     for row, b in enumerate(index.tolist()):
         window = stored.windows[b]
@@ -239,7 +259,11 @@ def _stored_hypotheses(stored: MissionHypotheses, windows: MissionWindows, index
                 shift_m = np.array(agent.datum_m) - windows.datum_m[b]
                 target = position[row, :, windows.agent_ids.index(agent.agent_id)]
                 target[:k], target[k:] = agent.position_m + shift_m, agent.position_m[0] + shift_m
+                if height is not None and agent.height_m is not None:
+                    high = height[row, :, windows.agent_ids.index(agent.agent_id)]
+                    high[:k], high[k:] = agent.height_m, agent.height_m[0]
     weight[weight.sum(axis=1) == 0] = 1.0  # nothing was drawn: all NaN, any weight does
     weight /= weight.sum(axis=1, keepdims=True)
     status = tuple(tuple("ok" for _ in windows.agent_ids) for _ in range(len(index)))
-    return HypothesisSet(torch.from_numpy(position), torch.from_numpy(weight), status)
+    high_m = None if height is None else torch.from_numpy(height)
+    return HypothesisSet(torch.from_numpy(position), torch.from_numpy(weight), status, height_m=high_m)

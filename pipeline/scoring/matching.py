@@ -55,7 +55,10 @@ def matched(found: HypothesisSet, match: Tensor) -> HypothesisSet:
         tuple(row[agent] if agent >= 0 else "no_detections" for agent in agents)
         for row, agents in zip(found.status, match.tolist(), strict=True)
     )
-    return HypothesisSet(position, found.weight, status)
+    height = found.height_m
+    if height is not None:
+        height = torch.where((match >= 0)[:, None, :, None], height.gather(2, pick[..., 0]), torch.nan)
+    return HypothesisSet(position, found.weight, status, height_m=height)
 
 
 def matched_windows(windows: WindowBatch, match: Tensor) -> WindowBatch:

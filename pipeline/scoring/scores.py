@@ -17,11 +17,12 @@ from torch import Tensor
 from cadence import metrics
 from cadence.arrays import Bools, Float64s, Int32s, Int64s
 from cadence.types import Estimator, HypothesisSet, WindowBatch
+from pipeline.scoring.heights import HEIGHT_METRICS, height_values
 
 METRICS = (
     "ade_m", "min_ade_m", "mean_error_m", "energy_score_m", "energy_score_fair_m", "trajectory_energy_score_m",
     "coverage_50", "coverage_90", "spread_m", "step_length_m", "true_step_length_m", "collision_share",
-    "fast_step_share", "fast_track_share",
+    "fast_step_share", "fast_track_share", *HEIGHT_METRICS,
 )  # fmt: skip
 """Columns of `Cells.value`.
 
@@ -29,6 +30,7 @@ ade_m is the expected distance of a hypothesis; min_ade_m that of the hypothesis
 window; trajectory_energy_score_m stands once per window, agent and side of the origin, at its first cell; step lengths
 from the step before; collision_share is NaN where no obstacles are known; fast_step_share is that of the hypotheses whose step
 to the cell is longer than hardly any true one, fast_track_share that of those with any such step, at the side's first cell.
+What is of heights, alone and as the third coordinate, is NaN where hypotheses or truth have none.
 """
 
 PARTS = ("past", "between", "future", "final")
@@ -115,8 +117,11 @@ def score_cells(
     inside: Tensor | None = None,
     fastest_m: float = float("inf"),
     is_brief: bool = False,
+    truth_height_m: Tensor | None = None,
 ) -> Cells:
     """Score one batch: truth_m [B, A, T, 2] relative to the datum, is_known [B, A, T], inside [B, K, A, T] in obstacles.
+
+    truth_height_m is [B, A, T], NaN where it is unknown.
 
     `fastest_m` is the length of a step that hardly any true one exceeds. Brief scores lack (NaN) what takes most of the time:
     energy scores, the best hypothesis, step lengths.
@@ -139,6 +144,10 @@ def score_cells(
     if math.isfinite(fastest_m):
         for side in (~is_future, is_future):
             _put_fast_steps(value, found.position_m, weight, chosen & side, fastest_m)
+    if found.height_m is not None and truth_height_m is not None and not is_brief:
+        high, true_high = found.height_m[rows, :, agents, steps], truth_height_m[chosen]
+        of_heights = height_values((at, high), weight[rows, :, agents], (truth_m[chosen], true_high))
+        value[..., -len(HEIGHT_METRICS) :][chosen] = of_heights
     if inside is not None:
         share = torch.einsum("bka,bkat->bat", weight, inside.double())
         value[..., METRICS.index("collision_share")] = share
@@ -157,6 +166,7 @@ def score_in_chunks(
     after_chunk: Callable[[int], object] | None = None,
     fastest_m: float = float("inf"),
     is_brief: bool = False,
+    truth_height_m: Tensor | None = None,
 ) -> Cells:
     """`score_cells` for any number of windows in bounded memory; windows without any cell to score are not drawn."""
     states = windows.num_agents * num_hypotheses * windows.num_steps
@@ -165,7 +175,8 @@ def score_in_chunks(
     for index in torch.split(asked, max(1, _MAX_STATES // states)):
         found = draw(index)
         inside = None if is_inside is None else is_inside(found.position_m, index)
-        part = score_cells(found, windows[index], truth_m[index], is_known[index], inside, fastest_m, is_brief)
+        high = None if truth_height_m is None else truth_height_m[index]
+        part = score_cells(found, windows[index], truth_m[index], is_known[index], inside, fastest_m, is_brief, high)
         parts.append(replace(part, window=index.numpy().astype(np.int32)[part.window]))
         if after_chunk is not None:
             after_chunk(len(index))
@@ -258,7 +269,11 @@ def _filled_up(found: HypothesisSet) -> tuple[HypothesisSet, Tensor]:
         return found, weight
     first = is_there.to(torch.int8).argmax(dim=1)[:, None, :, None, None]
     one = found.position_m.gather(1, first.expand(-1, -1, -1, *found.position_m.shape[3:]))
-    return replace(found, position_m=torch.where(is_there[..., None, None], found.position_m, one)), weight
+    filled = replace(found, position_m=torch.where(is_there[..., None, None], found.position_m, one))
+    if found.height_m is not None:
+        high = found.height_m.gather(1, first[..., 0].expand(-1, -1, -1, found.height_m.shape[3]))
+        filled = replace(filled, height_m=torch.where(is_there[..., None], found.height_m, high))
+    return filled, weight
 
 
 def _cell_values(at: Tensor, weight: Tensor, truth_m: Tensor, is_brief: bool) -> Tensor:
