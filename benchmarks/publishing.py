@@ -35,6 +35,7 @@ PAGES = {
     "several_targets": ("rendezvous", "attention_cost"),
     "association": ("association",),
     "not_stated": ("measurement_noise",),
+    "heights": ("height",),
     "clutter": ("clutter",),
     "evidence": ("silence",),
     "logs": ("log_reading", "plausibility", "log_writing"),
