@@ -31,6 +31,8 @@ _MODEL_ERROR: Final = 0.1
 """Modes are not quite those of real targets: simulated noise comes out up to so much too small."""
 _MIN_CHANGES: Final = 8
 _MIN_STEPS: Final = 2
+_LEAST_STEP_M: Final = 0.01
+"""Nobody rounds to less than a centimetre."""
 _NUM_STEPS: Final = 6
 """Of the smallest changes, those that are tried: now and then one altimeter of many states finer steps."""
 _MOST_MULTIPLE: Final = 20.0
@@ -78,9 +80,9 @@ def rounding_m(tracks: Sequence[HeightTrack]) -> float:
     change = change[change > 1e-6]
     if len(change) < _MIN_CHANGES:
         return 0.0
-    return max(
-        (step_m for step_m in np.unique(np.round(change, 3))[:_NUM_STEPS].tolist() if _is_step(step_m, change)), default=0.0
-    )
+    steps_m = np.unique(np.round(change, 3))
+    tried_m = steps_m[steps_m >= _LEAST_STEP_M][:_NUM_STEPS].tolist()
+    return max((step_m for step_m in tried_m if _is_step(step_m, change)), default=0.0)
 
 
 def _is_step(step_m: float, change_m: Float64s) -> bool:

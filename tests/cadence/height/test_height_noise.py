@@ -35,6 +35,17 @@ def test_rounding_is_found_and_is_the_least_noise():
     assert rounding_m([flight(0, 2.0)]) == 0.0
 
 
+def test_a_few_finer_altimeters_do_not_hide_the_step_of_most():
+    found = [flight(seed, 0.0, 30.48) for seed in range(9)] + [flight(9, 0.0, 7.62, num=24)]
+    assert rounding_m(found) == pytest.approx(30.48)
+
+
+def test_heights_that_hardly_change_are_not_rounded():
+    rng = np.random.default_rng(0)
+    height = np.cumsum(rng.normal(0, 4e-4, 500))
+    assert rounding_m([HeightTrack(np.arange(500.0), height, np.full(500, np.nan))]) == 0.0
+
+
 def test_level_heights_without_change_are_exact():
     time_s = np.arange(30.0)
     found = height_noise([HeightTrack(time_s, np.full(30, 12.5), np.full(30, np.nan))])
