@@ -95,16 +95,26 @@ class Bank:
         log_weight, evidence = em_weights(log_likelihood(models, telling, step_s, speed_mps), self.pseudo_count)
         return dataclasses.replace(self, models=models, log_weight=log_weight, later_weight=evidence, speed_mps=speed_mps)
 
-    def posterior(self, windows: WindowBatch, num_hypotheses: int) -> BankPosterior:
-        """Moments and joint samples for the active agents of `windows`, rows in the order of `is_active.nonzero()`."""
-        return self._posterior(windows, num_hypotheses, True)
+    def evidence(self, windows: WindowBatch) -> Tensor:
+        """Log likelihood [R, C] of the detections of active agents under every model."""
+        rows, _ = active_rows(windows)
+        rows = with_floor(rows, self.noise_steps * self.length_m(windows.step_s))
+        return log_likelihood(self.models, spaced(rows, self.spacing_steps * windows.step_s), windows.step_s, self._speed())
 
-    def _posterior(self, windows: WindowBatch, num_hypotheses: int, with_moments: bool) -> BankPosterior:
+    def posterior(self, windows: WindowBatch, num_hypotheses: int, evidence: Tensor | None = None) -> BankPosterior:
+        """Moments and joint samples for the active agents of `windows`, rows in the order of `is_active.nonzero()`.
+
+        `evidence` is what `evidence` says of these windows, where that is known already.
+        """
+        return self._posterior(windows, num_hypotheses, evidence, True)
+
+    def _posterior(
+        self, windows: WindowBatch, num_hypotheses: int, evidence: Tensor | None, with_moments: bool
+    ) -> BankPosterior:
         rows, seeds = active_rows(windows)
         floor_m = FLOOR_STEPS * self._speed() * windows.step_s
         rows = with_floor(rows, self.noise_steps * self.length_m(windows.step_s))
-        telling = spaced(rows, self.spacing_steps * windows.step_s)
-        evidence = log_likelihood(self.models, telling, windows.step_s, self._speed())
+        evidence = self.evidence(windows) if evidence is None else evidence
         log_posterior = self.temper * evidence + self._log_weight()
         parts = []
         nodes = with_floor(rows, floor_m)
@@ -122,9 +132,9 @@ class Bank:
         mean, sigma, sample = (torch.cat(columns) for columns in zip(*parts, strict=True))
         return BankPosterior(mean, sigma.clamp_min(floor_m), sample)
 
-    def sample(self, windows: WindowBatch, num_hypotheses: int) -> HypothesisSet:
+    def sample(self, windows: WindowBatch, num_hypotheses: int, evidence: Tensor | None = None) -> HypothesisSet:
         """Joint samples of the bank itself: the rival and release gate of the diffusion model."""
-        return scatter_hypotheses(self._posterior(windows, num_hypotheses, False).sample_m, windows)
+        return scatter_hypotheses(self._posterior(windows, num_hypotheses, evidence, False).sample_m, windows)
 
     def about(self) -> dict[str, float | int | None]:
         """What a summary says of it."""

@@ -59,11 +59,11 @@ class BankPool:
         sample = torch.zeros(*is_after.shape[:1], num_hypotheses, windows.num_steps, 2, dtype=torch.float64)
         first = torch.zeros(*is_after.shape, 2, dtype=torch.float64)
         second = torch.zeros(is_after.shape, dtype=torch.float64)
-        for index, bank in enumerate(self.members):
-            is_drawn = (past == index) | (future == index)
-            if not bool(is_drawn.any()):
-                continue
-            part = bank.posterior(windows, int(is_drawn.sum()))
+        drawn = [index for index in range(len(self.members)) if bool(((past == index) | (future == index)).any())]
+        evidence = dict(zip(drawn, _evidence([self.members[index] for index in drawn], windows), strict=True))
+        for index in drawn:
+            bank, is_drawn = self.members[index], (past == index) | (future == index)
+            part = bank.posterior(windows, int(is_drawn.sum()), evidence[index])
             is_own = torch.where(is_after[:, None], (future[is_drawn] == index)[:, None], (past[is_drawn] == index)[:, None])
             sample[:, is_drawn] = torch.where(is_own[..., None], part.sample_m, sample[:, is_drawn])
             share = torch.where(is_after, (future == index).double().mean(), (past == index).double().mean())
@@ -117,7 +117,25 @@ def _found(members: Sequence[Bank], windows: WindowBatch, unseen: Detections) ->
     """Distances of what the members draw to what the windows do not hold; None where that is too little."""
     if not windows.num_windows or num_tests(windows, unseen) < LEAST_TESTS:
         return None
-    return distances([member.sample(windows, NUM_DRAWN).position_m for member in members], windows, unseen)
+    evidence = _evidence(members, windows)
+    drawn = [member.sample(windows, NUM_DRAWN, said).position_m for member, said in zip(members, evidence, strict=True)]
+    return distances(drawn, windows, unseen)
+
+
+def _evidence(members: Sequence[Bank], windows: WindowBatch) -> list[Tensor]:
+    """What each member's models make of the detections; members that weigh the same models differently ask but once."""
+    found: list[Tensor] = []
+    for number, member in enumerate(members):
+        alike = (other for other in range(number) if _asks_alike(member, members[other]))
+        other = next(alike, None)
+        found.append(member.evidence(windows) if other is None else found[other])
+    return found
+
+
+def _asks_alike(one: Bank, other: Bank) -> bool:
+    return one.models is other.models and all(
+        getattr(one, name) == getattr(other, name) for name in ("noise_steps", "spacing_steps", "speed_mps")
+    )
 
 
 def best_weights(found: tuple[Tensor, Tensor] | None, safe: Tensor) -> Tensor:
