@@ -39,7 +39,7 @@ PAGES = {
     "clutter": ("clutter",),
     "evidence": ("silence",),
     "logs": ("log_reading", "plausibility", "log_writing"),
-    "runs": ("batch", "batch_engines", "memory", "many_agents"),
+    "runs": ("run_cost", "batch", "batch_engines", "memory", "many_agents"),
     "rivals": (),
 }
 """The scripts whose sections stand on a page."""
