@@ -95,16 +95,10 @@ class Bank:
         log_weight, evidence = em_weights(log_likelihood(models, telling, step_s, speed_mps), self.pseudo_count)
         return dataclasses.replace(self, models=models, log_weight=log_weight, later_weight=evidence, speed_mps=speed_mps)
 
-    def evidence(self, windows: WindowBatch) -> Tensor:
-        """Log likelihood [R, C] of the detections of active agents under every model."""
-        rows, _ = active_rows(windows)
-        rows = with_floor(rows, self.noise_steps * self.length_m(windows.step_s))
-        return log_likelihood(self.models, spaced(rows, self.spacing_steps * windows.step_s), windows.step_s, self._speed())
-
     def posterior(self, windows: WindowBatch, num_hypotheses: int, evidence: Tensor | None = None) -> BankPosterior:
         """Moments and joint samples for the active agents of `windows`, rows in the order of `is_active.nonzero()`.
 
-        `evidence` is what `evidence` says of these windows, where that is known already.
+        `evidence` is what `model_evidence` says of these windows, where that is known already.
         """
         return self._posterior(windows, num_hypotheses, evidence, True)
 
@@ -114,7 +108,7 @@ class Bank:
         rows, seeds = active_rows(windows)
         floor_m = FLOOR_STEPS * self._speed() * windows.step_s
         rows = with_floor(rows, self.noise_steps * self.length_m(windows.step_s))
-        evidence = self.evidence(windows) if evidence is None else evidence
+        evidence = model_evidence(self, windows) if evidence is None else evidence
         log_posterior = self.temper * evidence + self._log_weight()
         parts = []
         nodes = with_floor(rows, floor_m)
@@ -218,6 +212,14 @@ class Bank:
             ]
         for whole, part, where in replaced:
             whole.copy_(torch.where(where, part, whole))
+
+
+def model_evidence(bank: Bank, windows: WindowBatch) -> Tensor:
+    """Log likelihood [R, C] of the detections of active agents under every model of a bank."""
+    rows, _ = active_rows(windows)
+    length_m = bank.length_m(windows.step_s)
+    telling = spaced(with_floor(rows, bank.noise_steps * length_m), bank.spacing_steps * windows.step_s)
+    return log_likelihood(bank.models, telling, windows.step_s, bank._speed())
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from cadence.bank.bank import Bank, BankPosterior
+from cadence.bank.bank import Bank, BankPosterior, model_evidence
 from cadence.bank.hindsight import LEAST_TESTS, Test, distances, num_tests
 from cadence.bank.rows import active_rows, scatter_hypotheses
 from cadence.types import Detections, HypothesisSet, WindowBatch
@@ -128,7 +128,7 @@ def _evidence(members: Sequence[Bank], windows: WindowBatch) -> list[Tensor]:
     for number, member in enumerate(members):
         alike = (other for other in range(number) if _asks_alike(member, members[other]))
         other = next(alike, None)
-        found.append(member.evidence(windows) if other is None else found[other])
+        found.append(model_evidence(member, windows) if other is None else found[other])
     return found
 
 
