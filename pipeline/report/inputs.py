@@ -5,6 +5,7 @@ from pathlib import Path
 from pipeline.look_files import LOOK_FILES
 from pipeline.missions import CATALOGUE_NAME, no_mission
 from pipeline.obstacle_file import OBSTACLES_NAME
+from pipeline.stories import MISSION_NAME
 
 STAGES = ("ingest", "extract", "infer", "retrospect", "export", "evaluate")
 """Stages whose manifests the page shows, in the order of the work."""
@@ -20,6 +21,7 @@ def mission_inputs(directory: Path) -> list[Path]:
         "labels.parquet",
         "truth.parquet",
         "poses.parquet",
+        MISSION_NAME,
         *LOOK_FILES,
         "scores.json",
         "answers.json",

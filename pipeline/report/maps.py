@@ -19,22 +19,22 @@ MAX_STATIC_HYPOTHESES = 40
 
 
 class View:
-    """From mission metres to the pixels of a small map: equal scales, north up."""
+    """From mission metres to the pixels of a map, a small one by default: equal scales, north up."""
 
-    def __init__(self, position_m: Float64s, margin: float = 0.08) -> None:
+    def __init__(self, position_m: Float64s, margin: float = 0.08, pixels: tuple[int, int] = (MAP_WIDTH, MAP_HEIGHT)) -> None:
         low, high = position_m.min(axis=0), position_m.max(axis=0)
         size = np.maximum(high - low, max(float((high - low).max()) * 0.05, 1.0))
-        self.pixel_per_m = float(min(MAP_WIDTH / size[0], MAP_HEIGHT / size[1]) * (1 - 2 * margin))
-        self._centre_m = (low + high) / 2
+        self.pixel_per_m = float(min(pixels[0] / size[0], pixels[1] / size[1]) * (1 - 2 * margin))
+        self._centre_m, self._middle = (low + high) / 2, (pixels[0] / 2, pixels[1] / 2)
 
     def pixels(self, position_m: Float64s) -> Float64s:
         """[..., 2] metres to [..., 2] pixels."""
         shifted = (np.asarray(position_m, dtype=np.float64) - self._centre_m) * self.pixel_per_m
-        return np.asarray(shifted * (1, -1) + (MAP_WIDTH / 2, MAP_HEIGHT / 2))
+        return np.asarray(shifted * (1, -1) + self._middle)
 
     def metres(self, pixels: Float64s) -> Float64s:
         """[..., 2] pixels to [..., 2] metres."""
-        shifted = (np.asarray(pixels, dtype=np.float64) - (MAP_WIDTH / 2, MAP_HEIGHT / 2)) * (1, -1)
+        shifted = (np.asarray(pixels, dtype=np.float64) - self._middle) * (1, -1)
         return np.asarray(shifted / self.pixel_per_m + self._centre_m)
 
 
@@ -55,18 +55,18 @@ def moment_map(
     seen_m = detections.position_m
     is_near = ((seen_m >= track_m.min(axis=(0, 1))) & (seen_m <= track_m.max(axis=(0, 1)))).all(axis=1)
     view = View(np.concatenate([low[None], high[None], *(line_m for _, _, line_m in lines), seen_m[is_near]]))
-    parts = [_obstacle(item, view) for item in mission.obstacles]
+    parts = [draw_obstacle(item, view) for item in mission.obstacles]
     if truth is not None:
-        parts.append(_line(view.pixels(truth.between(first_ns, last_ns).position_m), "truth"))
+        parts.append(draw_line(view.pixels(truth.between(first_ns, last_ns).position_m), "truth"))
     parts += _hypotheses(view.pixels(track_m), fan.weight, now)
     for _, first, line_m in lines:
         line, split = view.pixels(line_m), fan.origin_index - first
-        parts += [_line(line[: max(split, 0) + 1], "past mean"), _line(line[max(split, 0) :], "future mean")]
+        parts += [draw_line(line[: max(split, 0) + 1], "past mean"), draw_line(line[max(split, 0) :], "future mean")]
     age = (fan.origin_ns - detections.time_ns) / max(fan.origin_ns - first_ns, 1)
     parts += _dots(view.pixels(detections.position_m), age)
     parts += [f'<circle class="now" cx="{x:.1f}" cy="{y:.1f}" r="6"/>' for x, y in _now(lines, fan.origin_index, view)]
     parts += [_share(strand, first, view.pixels(line_m)) for strand, first, line_m in lines]
-    parts += [scale_bar(view.pixel_per_m), NORTH_ARROW]
+    parts += [scale_bar(view.pixel_per_m), north_arrow()]
     opening = f'<svg class="map" viewBox="0 0 {MAP_WIDTH} {MAP_HEIGHT}" role="img" aria-label="{escape(label)}">'
     return f"{opening}{''.join(parts)}</svg>"
 
@@ -102,7 +102,7 @@ def _hypotheses(pixels: Float64s, weight: Float64s, now: int) -> list[str]:
     parts = []
     for k in heaviest.tolist():
         opacity = max(0.05, base * float(weight[k] / weight.max()))
-        parts += [_line(pixels[k, : now + 1], "past", opacity), _line(pixels[k, now:], "future", opacity)]
+        parts += [draw_line(pixels[k, : now + 1], "past", opacity), draw_line(pixels[k, now:], "future", opacity)]
     return parts
 
 
@@ -120,34 +120,37 @@ def _dots(pixels: Float64s, age: Float64s) -> list[str]:
     return parts
 
 
-NORTH_ARROW = (
-    f'<g class="furniture" transform="translate({MAP_WIDTH - 20} 26)"><path d="M0 -14 L5 2 L0 -2 L-5 2 Z"/>'
-    '<text y="15" text-anchor="middle">N</text></g>'
-)
+def north_arrow(width: int = MAP_WIDTH) -> str:
+    """An arrow at the upper right."""
+    return (
+        f'<g class="furniture" transform="translate({width - 20} 26)"><path d="M0 -14 L5 2 L0 -2 L-5 2 Z"/>'
+        '<text y="15" text-anchor="middle">N</text></g>'
+    )
 
 
-def scale_bar(pixel_per_m: float) -> str:
+def scale_bar(pixel_per_m: float, height: int = MAP_HEIGHT) -> str:
     """A bar of a round length at the lower left."""
     length_m = nice_length(MAP_WIDTH * 0.28 / pixel_per_m)
     width = length_m * pixel_per_m
-    bottom = MAP_HEIGHT - 12
+    bottom = height - 12
     return (
         f'<g class="furniture"><path class="bar" d="M12 {bottom - 5} v5 h{width:.1f} v-5"/>'
         f'<text x="{12 + width / 2:.1f}" y="{bottom - 7}" text-anchor="middle">{metres(length_m)}</text></g>'
     )
 
 
-def _line(pixels: Float64s, kind: str, opacity: float | None = None) -> str:
+def draw_line(pixels: Float64s, kind: str, opacity: float | None = None) -> str:
+    """A polyline of [N, 2] pixels and a class of the style sheet; empty for less than two points."""
     if len(pixels) < 2:
         return ""
-    kept = _simplify(pixels)
+    kept = simplify(pixels)
     points = " ".join(f"{x:.1f},{y:.1f}" for x, y in kept)
     faded = f' stroke-opacity="{opacity:.2f}"' if opacity is not None else ""
     return f'<polyline class="{kind}" points="{points}"{faded}/>'
 
 
-def _simplify(pixels: Float64s, tolerance: float = 0.4) -> Float64s:
-    """Without the points that lie closer than `tolerance` pixels to the chord (Douglas and Peucker, 1973)."""
+def simplify(pixels: Float64s, tolerance: float = 0.4) -> Float64s:
+    """[N, 2] without the points that lie closer than `tolerance` pixels to the chord (Douglas and Peucker, 1973)."""
     keep = np.zeros(len(pixels), dtype=bool)
     keep[[0, -1]] = True
     spans = [(0, len(pixels) - 1)]
@@ -166,10 +169,11 @@ def _simplify(pixels: Float64s, tolerance: float = 0.4) -> Float64s:
     return pixels[keep]
 
 
-def _obstacle(item: Obstacle, view: View) -> str:
+def draw_obstacle(item: Obstacle, view: View) -> str:
+    """Its outline and holes, or its circle, with its name where a pointer rests."""
     title = f"<title>{escape(item.name)}</title>" if item.name else ""
     if item.centre_m is not None:
         x, y = view.pixels(np.array(item.centre_m))
         return f'<circle class="obstacle" cx="{x:.1f}" cy="{y:.1f}" r="{item.radius_m * view.pixel_per_m:.1f}">{title}</circle>'
-    rings = [" L".join(f"{x:.1f} {y:.1f}" for x, y in _simplify(view.pixels(ring))) for ring in item.rings_m if len(ring)]
+    rings = [" L".join(f"{x:.1f} {y:.1f}" for x, y in simplify(view.pixels(ring))) for ring in item.rings_m if len(ring)]
     return f'<path class="obstacle" d="{" ".join(f"M{ring} Z" for ring in rings)}">{title}</path>'

@@ -30,6 +30,7 @@ from pipeline.presence import with_presence
 from pipeline.report.inputs import STAGES
 from pipeline.report.origins import Origins, origins_of, with_likeliest
 from pipeline.results import AgentHypotheses, MissionHypotheses, WindowHypotheses, read_hypothesis_tables
+from pipeline.stories import MISSION_NAME, MissionStories, read_stories
 from pipeline.tables import Frame, read_table
 from pipeline.tracks import UNKNOWN_AGENT
 
@@ -37,6 +38,9 @@ JsonDict = dict[str, Any]
 
 LIKELY = 0.5
 """An agent that is less likely there than this is rather none, as for `cadence evaluate`."""
+
+MAX_STORIES = 30
+"""Mission hypotheses that are drawn: the first, as they are in no order."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,6 +133,7 @@ class Mission:
     answers, events           what export answered to configured questions, and events
     stored, solid             hypotheses and obstacles as other stages see them
     looks                     of sensors whose footprints are stated, in seconds from start_ns
+    stories                   the first mission hypotheses; None in results without any
     """
 
     log: str
@@ -155,6 +160,7 @@ class Mission:
     answers: tuple[JsonDict, ...] = ()
     events: tuple[Event, ...] = ()
     looks: tuple[tuple[Footprint, Looks], ...] = ()
+    stories: MissionStories | None = None
 
     def called(self, agent: int, rows: Iterable[WindowRow]) -> str:
         """The agent's name with how likely it is there: the largest probability among `rows`, which are its own."""
@@ -257,6 +263,7 @@ def load_mission(directory: Path) -> Mission:
         answers=tuple(answers),
         events=tuple(events),
         looks=read_looks(directory, start_ns),
+        stories=read_stories(directory, MAX_STORIES) if (directory / MISSION_NAME).is_file() else None,
     )
 
 

@@ -67,8 +67,8 @@ $sections</main>
 """)
 
 
-def write_page(mission: Mission, analysis: Analysis, payload: Payload, moments: Sequence[Moment]) -> str:
-    """The whole page as text."""
+def write_page(mission: Mission, analysis: Analysis, payload: Payload, moments: Sequence[Moment], whole: str = "") -> str:
+    """The page as text; `whole` is the section with the map of the whole mission."""
     script = _asset("page.js")
     # Only our own script may run and nothing may be fetched, whatever a log manages to put into the page.
     digest = base64.b64encode(hashlib.sha256(script.encode("utf-8")).digest()).decode("ascii")
@@ -79,6 +79,7 @@ def write_page(mission: Mission, analysis: Analysis, payload: Payload, moments: 
         verdict_section(mission, analysis, payload.num_parted),
         _figures(mission),
         suspicions_section(mission),
+        whole,
         answers_section(mission, mission.answers, mission.events),
         _reading(mission),
         _explorer(mission, payload),

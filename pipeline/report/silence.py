@@ -12,7 +12,7 @@ from cadence.evidence.silence import Looks
 from pipeline.clock import Clock
 from pipeline.lengths import metres
 from pipeline.looks import Footprint
-from pipeline.report.maps import MAP_HEIGHT, MAP_WIDTH, NORTH_ARROW, View, scale_bar
+from pipeline.report.maps import MAP_HEIGHT, MAP_WIDTH, View, north_arrow, scale_bar
 from pipeline.report.markup import section, table, text
 from pipeline.report.mission import Mission
 
@@ -115,7 +115,7 @@ def _coverage_map(mission: Mission, view: View, first_s: float, last_s: float, f
         f'<circle class="detection" cx="{x:.1f}" cy="{y:.1f}" r="3"/>' for x, y in view.pixels(detections.position_m).tolist()
     ]
     opening = f'<svg class="map" viewBox="0 0 {MAP_WIDTH} {MAP_HEIGHT}" role="img" aria-label="Covered {text(label)}">'
-    return f"{opening}{''.join([*cells, *dots, scale_bar(view.pixel_per_m), NORTH_ARROW])}</svg>"
+    return f"{opening}{''.join([*cells, *dots, scale_bar(view.pixel_per_m), north_arrow()])}</svg>"
 
 
 def _table(mission: Mission) -> str:

@@ -21,6 +21,7 @@ from pipeline.report.modes import strands_of_all
 from pipeline.report.page import write_page
 from pipeline.report.payload import Payload, build_payload
 from pipeline.report.scored import score_mission
+from pipeline.report.whole import whole_section
 from pipeline.threads import one_thread
 
 FIXED_BYTES, BYTES_A_POINT, BYTES_A_CELL, BYTES_A_TICK = 300_000, 25, 60, 14
@@ -33,8 +34,9 @@ def write_report(directory: Path, folder: Path, config: ReportConfig, progress: 
     with one_thread(), progress.bar(2 * len(mission.fans), "report", unit="fan") as bar:
         analysis = analyse(mission, score_mission(directory, mission), bar.update)
         moments = choose_moments(mission, analysis, config.num_moments)
-        payload = _payload(mission, config, moments, bar)
-    page = write_page(mission, analysis, payload, moments)
+        whole = whole_section(mission, config.max_megabytes * 1e6)
+        payload = _payload(mission, config, moments, len(whole), bar)
+    page = write_page(mission, analysis, payload, moments, whole)
     # Names come from logs: a lone surrogate in one must cost that letter, not the page.
     content = page.encode("utf-8", "replace")
     (folder / "report.html").write_bytes(content)
@@ -47,9 +49,9 @@ def write_report(directory: Path, folder: Path, config: ReportConfig, progress: 
     }
 
 
-def _payload(mission: Mission, config: ReportConfig, moments: Sequence[Moment], bar: "tqdm[Any]") -> Payload:
+def _payload(mission: Mission, config: ReportConfig, moments: Sequence[Moment], taken_bytes: int, bar: "tqdm[Any]") -> Payload:
     wanted = Detail(len(mission.drawn_windows), len(mission.told_agents), config.max_hypotheses, config.max_vertices)
-    detail = choose_detail(mission, _budget_bytes(mission, config), wanted)
+    detail = choose_detail(mission, _budget_bytes(mission, config, taken_bytes), wanted)
     windows = _shown_windows(mission, detail.num_windows, [mission.fans[moment.fan].window for moment in moments])
     agents = _shown_agents(mission, detail.num_agents, [mission.fans[moment.fan].agent for moment in moments])
     shown_windows, shown_agents, codes = set(windows), set(agents), list[FanCode]()
@@ -62,11 +64,13 @@ def _payload(mission: Mission, config: ReportConfig, moments: Sequence[Moment], 
     return build_payload(mission, codes, windows, agents, geodesy, config.max_points, shown_share(mission))
 
 
-def _budget_bytes(mission: Mission, config: ReportConfig) -> float:
+def _budget_bytes(mission: Mission, config: ReportConfig, taken_bytes: int) -> float:
     points = [found for found in (mission.detections, mission.truth, mission.poses) if found is not None]
     num_points = sum(min(len(found), config.max_points) for found in points)
     num_ticks = min(len(mission.detections), MAX_TICKS * len(mission.agents))
-    others = FIXED_BYTES + num_points * BYTES_A_POINT + len(mission.rows) * BYTES_A_CELL + num_ticks * BYTES_A_TICK
+    others = (
+        taken_bytes + FIXED_BYTES + num_points * BYTES_A_POINT + len(mission.rows) * BYTES_A_CELL + num_ticks * BYTES_A_TICK
+    )
     return max(config.max_megabytes * 1e6 - others, config.max_megabytes * 2e5)
 
 
