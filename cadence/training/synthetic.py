@@ -186,5 +186,5 @@ def _stack(parts: list[Detections]) -> Detections:
             filler = filler + torch.eye(2, dtype=value.dtype)
         return torch.cat([value, filler], dim=2)
 
-    names = [field.name for field in dataclasses.fields(Detections)]
-    return Detections(*(torch.cat([padded(getattr(part, name)) for part in parts]) for name in names))
+    names = [name for name, value in vars(parts[0]).items() if value is not None]
+    return Detections(**{name: torch.cat([padded(getattr(part, name)) for part in parts]) for name in names})

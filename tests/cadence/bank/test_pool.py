@@ -72,9 +72,10 @@ def test_past_and_future_come_from_their_members() -> None:
 def test_targets_that_stay_about_a_place_are_drawn_with_a_home() -> None:
     times = torch.arange(30, dtype=torch.float64) * 6.0
     tracks = simulate(home_ranges([5.0], [1.0], [4.0]), times, 0.02, 30, 3)
-    names = [field.name for field in dataclasses.fields(Detections)]
-    past = Detections(*(getattr(tracks, name)[:, :, :20] for name in names))
-    later = Detections(*(getattr(tracks, name)[:, :, 20:] for name in names))
+    known = {name: value for name, value in vars(tracks).items() if value is not None}
+    past, later = (
+        Detections(**{name: value[:, :, cut] for name, value in known.items()}) for cut in (slice(20), slice(20, None))
+    )
     shown = dataclasses.replace(past, time_s=past.time_s - 114.0)
     windows = WindowBatch(torch.arange(-63.0, 61.0, dtype=torch.float64), shown, torch.arange(30), 63)
     bank = Bank().fit(past, 1.0)

@@ -79,10 +79,11 @@ def steady_and_few_wild(num_steady: int = 30, num_wild: int = 3) -> tuple[Window
         simulate(constant_velocity([noise], initial_speed=1.0), times, 0.02, number, 5)
         for noise, number in ((1e-5, num_steady), (3.0, num_wild))
     ]
-    fields = [field.name for field in dataclasses.fields(Detections)]
-    both = Detections(*(torch.cat([getattr(part, name) for part in parts]) for name in fields))
+    fields = [name for name, value in vars(parts[0]).items() if value is not None]
+    both = Detections(**{name: torch.cat([getattr(part, name) for part in parts]) for name in fields})
     both = dataclasses.replace(both, time_s=both.time_s - 26.0)
-    past, later = (Detections(*(getattr(both, name)[:, :, cut] for name in fields)) for cut in (slice(14), slice(14, None)))
+    cuts = (slice(14), slice(14, None))
+    past, later = (Detections(**{name: getattr(both, name)[:, :, cut] for name in fields}) for cut in cuts)
     return WindowBatch(torch.arange(-27.0, 13.0, dtype=torch.float64), past, torch.arange(num_steady + num_wild), 27), later
 
 

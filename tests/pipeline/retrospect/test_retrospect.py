@@ -162,7 +162,9 @@ def test_later_stages_refuse_stories_of_other_detections(tmp_path):
     check_chain("export", directory, {})
 
 
-def three_associations(time_s, position_m, covariance_m2, origins_s, config, seed, habits=None) -> list[AssociationHypotheses]:
+def three_associations(
+    time_s, position_m, covariance_m2, origins_s, config, seed, habits=None, on_step=int
+) -> list[AssociationHypotheses]:
     """The truth; one detection given to the other agent; one taken for clutter."""
     label = np.stack([TRUE, SWAPPED, CLUTTERED])[:, : len(time_s)]
     return [AssociationHypotheses(label[:, : int((time_s <= origin).sum())], WEIGHT, 2) for origin in origins_s]
