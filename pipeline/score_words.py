@@ -11,8 +11,9 @@ ESTIMATORS: Final[Mapping[str, str]] = {
     "linear": "straight lines",
     "hold": "stays where seen",
     "ring": "distance rings",
+    "mission": "mission hypotheses (all detections)",
 }
-"""Rivals of `cadence evaluate`; others are called by their names."""
+"""Rivals and mission hypotheses of `cadence evaluate`; others are called by their names."""
 
 METRICS: Final[Mapping[str, str]] = {
     "energy_score_m": "energy score",

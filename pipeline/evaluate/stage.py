@@ -21,6 +21,7 @@ from pipeline.evaluate.joint import JointCells, JointScorer
 from pipeline.evaluate.maps import RING_NAME, MapCells, MapScorer
 from pipeline.evaluate.rivals import RIVALS
 from pipeline.evaluate.tables import OWN_NAME, ScoredMission, as_csv, as_json, as_markdown, headline, pool, verdict
+from pipeline.evaluate.whole import WholeCells, score_whole
 from pipeline.files import write_atomic
 from pipeline.forecast.stage import ForecastConfig, evaluate_forecasts
 from pipeline.manifest import StageResult, check_chain, manifest_path, run_stage
@@ -31,6 +32,7 @@ from pipeline.results import read_hypothesis_tables
 from pipeline.scoring.case import LABELS_NAME, Case, collision_test, mission_obstacles, read_case
 from pipeline.scoring.motion import MotionLaws, true_motion
 from pipeline.scoring.scores import Cells, Draw, IsInside, score_in_chunks
+from pipeline.stories import MISSION_NAME, read_stories
 from pipeline.windows import build_windows
 
 
@@ -100,7 +102,7 @@ def evaluate(directory: Path, config: EvaluateConfig, progress: Progress, force:
             f"{inputs[-1]}: not found, so there is nothing to score against; name a truth channel in [[extract.truth]] "
             "or thin a dense one (extract.thinning), then run extract and infer again"
         )
-    more = (directory / OBSTACLES_NAME, directory / LABELS_NAME, manifest_path("infer", directory))
+    more = (directory / OBSTACLES_NAME, directory / LABELS_NAME, directory / MISSION_NAME, manifest_path("infer", directory))
     inputs += [path for path in more if path.is_file()]
 
     def body(work: Path) -> Mapping[str, Any]:
@@ -189,10 +191,22 @@ def score_mission(directory: Path, config: EvaluateConfig, progress: Progress) -
         motion={name: laws for name, (_, _, laws) in found.items()},
         true_motion=truth.laws(),
         maps={**mapped, RING_NAME: maps.rings()},
+        whole=_whole(directory, case, own, truth.fastest_m),
         gospa_cutoff_m=case.cutoff_m if case.is_joint else None,
         is_matched=case.is_matched,
         true_collision_share=_collision_share(collision_test(obstacles, windows, are_ways_straight=False), case),
     )
+
+
+def _whole(directory: Path, case: Case, own: Cells, fastest_m: float) -> WholeCells | None:
+    """Mission hypotheses, as many as a window has, as scores depend on their number; None in results without any."""
+    if not (directory / MISSION_NAME).is_file():
+        return None
+
+    def score(draw: Draw, is_known: Tensor, num_stories: int) -> Cells:
+        return score_in_chunks(draw, case.scored, case.truth_m, is_known, num_stories, fastest_m=fastest_m)
+
+    return score_whole(case, read_stories(directory, case.num_hypotheses), own, score)
 
 
 def _collision_share(collides: IsInside | None, case: Case) -> float | None:

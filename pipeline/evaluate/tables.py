@@ -13,6 +13,8 @@ from cadence.arrays import Int64s
 from pipeline.counted import counted
 from pipeline.evaluate.joint import JOINT_METRICS, JointCells, block_of, summarise_joint
 from pipeline.evaluate.maps import MapCells, map_rows
+from pipeline.evaluate.markdown import line, ordered, value, with_interval
+from pipeline.evaluate.whole import WholeCells, whole_rows, whole_table, whole_verdict
 from pipeline.plain_rows import rows_as_csv, without_nan
 from pipeline.score_words import coverage_words, estimator_words
 from pipeline.scoring.motion import MotionLaws, MotionSample, motion_rows
@@ -59,6 +61,7 @@ class ScoredMission:
     joint         by estimator, scores of all agents together; empty for one agent
     maps          by estimator and of the distance rings, MapScore of some cells
     is_matched    detections are of unknown origin: agents were matched to those of the truth
+    whole         mission hypotheses beside the windows; None where there are none to compare
     """
 
     log_id: str
@@ -76,6 +79,7 @@ class ScoredMission:
     true_motion: MotionLaws = field(default_factory=dict)
     true_collision_share: float | None = None
     maps: dict[str, MapCells] = field(default_factory=dict)
+    whole: WholeCells | None = None
 
 
 @dataclass(frozen=True)
@@ -130,6 +134,8 @@ def pool(missions: Sequence[ScoredMission], num_resamples: int, seed: int) -> Sc
     rows += _motion_rows(missions, names)
     mapped = [(mission.maps, mission.num_windows) for mission in missions if mission.maps]
     rows += map_rows(mapped, grouped_by == "log", num_resamples, seed)
+    whole = [mission.whole for mission in missions if mission.whole is not None]
+    rows += whole_rows(whole, OWN_NAME, grouped_by == "log", num_resamples, seed)
     ratios = []
     for rival in names[1:]:
         for part in PARTS:
@@ -195,6 +201,7 @@ def as_markdown(report: ScoreReport) -> str:
     lines = ["# Scores", "", *(f"* {line}" for line in verdict(report)), "", *_preface(report)]
     for part in PARTS:
         lines += _part_table(report, part)
+    lines += whole_table(report.rows, OWN_NAME)
     lines += _motion_table(report)
     lines += _ratio_table(report)
     lines += _joint_tables(report)
@@ -204,9 +211,9 @@ def as_markdown(report: ScoreReport) -> str:
 
 
 def verdict(report: ScoreReport) -> list[str]:
-    """What to believe: a sentence on past and future each (best rival, 90 % region), and one on obstacles that are none."""
+    """What to believe: a sentence on past, future (best rival, 90 % region), mission hypotheses, obstacles that are none."""
     parts = [" ".join([f"{part.capitalize()}:", *found]) for part in ("past", "future") if (found := _verdict(report, part))]
-    return [*parts, *_entered(report.logs)]
+    return [*parts, *whole_verdict(report.rows), *_entered(report.logs)]
 
 
 def _entered(logs: Sequence[ScoredLog]) -> Iterator[str]:
@@ -283,12 +290,12 @@ def _part_table(report: ScoreReport, part: str) -> list[str]:
     if not found:
         return []
     shown = [name for name in _PART_METRICS if any(metric == name for _, metric in found)]
-    lines = [f"## {part.capitalize()}", "", _line(["estimator", *(_PART_METRICS[name] for name in shown), "cells"])]
-    lines.append(_line(["---"] * (len(shown) + 2)))
-    for estimator in _ordered(row.estimator for row in found.values()):
+    lines = [f"## {part.capitalize()}", "", line(["estimator", *(_PART_METRICS[name] for name in shown), "cells"])]
+    lines.append(line(["---"] * (len(shown) + 2)))
+    for estimator in ordered(row.estimator for row in found.values()):
         rows = [found.get((estimator, name)) for name in shown]
-        cells = [(_with_interval if name == "energy_score_m" else _value)(row) for name, row in zip(shown, rows, strict=True)]
-        lines.append(_line([estimator, *cells, str(next((row.num_cells for row in rows if row), 0))]))
+        cells = [(with_interval if name == "energy_score_m" else value)(row) for name, row in zip(shown, rows, strict=True)]
+        lines.append(line([estimator, *cells, str(next((row.num_cells for row in rows if row), 0))]))
     return [*lines, ""]
 
 
@@ -309,11 +316,11 @@ def _motion_table(report: ScoreReport) -> list[str]:
         "Too fast: longer than all true steps but one in a thousand. Distances: Wasserstein's, to the truth's law.",
         "",
     ]
-    lines += [_line(["estimator", "", *titles.values()]), _line(["---"] * (len(titles) + 2))]
-    for estimator in _ordered(name for name, _, _ in found):
+    lines += [line(["estimator", "", *titles.values()]), line(["---"] * (len(titles) + 2))]
+    for estimator in ordered(name for name, _, _ in found):
         for part in ("past", "future"):
-            cells = [_value(found.get((estimator, part, metric))) for metric in titles]
-            lines.append(_line([estimator, part, *cells]))
+            cells = [value(found.get((estimator, part, metric))) for metric in titles]
+            lines.append(line([estimator, part, *cells]))
     return [*lines, ""]
 
 
@@ -321,10 +328,10 @@ def _ratio_table(report: ScoreReport) -> list[str]:
     if not report.ratios:
         return []
     lines = [f"## Energy score of {report.ratios[0].estimator} over that of", ""]
-    lines += [_line(["rival", *PARTS]), _line(["---"] * (len(PARTS) + 1))]
-    for rival in _ordered(row.rival for row in report.ratios):
+    lines += [line(["rival", *PARTS]), line(["---"] * (len(PARTS) + 1))]
+    for rival in ordered(row.rival for row in report.ratios):
         by_part = {row.part: row for row in report.ratios if row.rival == rival}
-        lines.append(_line([rival, *(_with_interval(by_part.get(part)) for part in PARTS)]))
+        lines.append(line([rival, *(with_interval(by_part.get(part)) for part in PARTS)]))
     return [*lines, ""]
 
 
@@ -338,14 +345,12 @@ def _joint_tables(report: ScoreReport) -> list[str]:
         found = {(row.estimator, row.metric): row for row in rows if row.part == part}
         shown = [name for name in JOINT_METRICS if any(metric == name for _, metric in found)]
         if shown:
-            lines += [f"### {part.capitalize()}", "", _line(["estimator", *(_JOINT_TITLES[name] for name in shown), "windows"])]
-            lines.append(_line(["---"] * (len(shown) + 2)))
-        for estimator in _ordered(name for name, _ in found):
+            lines += [f"### {part.capitalize()}", "", line(["estimator", *(_JOINT_TITLES[name] for name in shown), "windows"])]
+            lines.append(line(["---"] * (len(shown) + 2)))
+        for estimator in ordered(name for name, _ in found):
             cells = [found.get((estimator, name)) for name in shown]
-            texts = [
-                (_with_interval if name in _WITH_INTERVAL else _value)(row) for name, row in zip(shown, cells, strict=True)
-            ]
-            lines.append(_line([estimator, *texts, str(max(row.num_cells for row in cells if row))]))
+            texts = [(with_interval if name in _WITH_INTERVAL else value)(row) for name, row in zip(shown, cells, strict=True)]
+            lines.append(line([estimator, *texts, str(max(row.num_cells for row in cells if row))]))
         lines += [""] if shown else []
     return lines
 
@@ -370,31 +375,13 @@ def _slice_table(report: ScoreReport, part: str, by: str, title: str) -> list[st
     rows = [row for row in report.rows if row.part == part and row.by == by]
     if not rows:
         return []
-    names = _ordered(row.estimator for row in rows)
-    lines = [f"## {title}", "", _line(["steps", *(f"{name} energy m" for name in names), f"{names[0]} in 90 %", "cells"])]
-    lines.append(_line(["---"] * (len(names) + 3)))
-    for bounds in _ordered((row.above_steps, row.up_to_steps) for row in rows):
+    names = ordered(row.estimator for row in rows)
+    lines = [f"## {title}", "", line(["steps", *(f"{name} energy m" for name in names), f"{names[0]} in 90 %", "cells"])]
+    lines.append(line(["---"] * (len(names) + 3)))
+    for bounds in ordered((row.above_steps, row.up_to_steps) for row in rows):
         found = {(row.estimator, row.metric): row for row in rows if (row.above_steps, row.up_to_steps) == bounds}
         energies = [found.get((name, "energy_score_m")) for name in names]
         label = f"{max(bounds[0] or 0.0, 0.0):g}–{bounds[1]:g}"
         count = next((row.num_cells for row in energies if row), 0)
-        lines.append(_line([label, *map(_value, energies), _value(found.get((names[0], "coverage_90"))), str(count)]))
+        lines.append(line([label, *map(value, energies), value(found.get((names[0], "coverage_90"))), str(count)]))
     return [*lines, ""]
-
-
-def _ordered(values: Any) -> list[Any]:
-    return list(dict.fromkeys(values))
-
-
-def _line(cells: Sequence[str]) -> str:
-    return "| " + " | ".join(cells) + " |"
-
-
-def _value(row: ScoreRow | RatioRow | None) -> str:
-    return "–" if row is None or math.isnan(row.value) else f"{row.value:.3g}"
-
-
-def _with_interval(row: ScoreRow | RatioRow | None) -> str:
-    if row is None or math.isnan(row.low):
-        return _value(row)
-    return f"{row.value:.3g} [{row.low:.3g}, {row.high:.3g}]"

@@ -92,8 +92,8 @@ class Cells:
 class ScoreRow:
     """One number of a table: the mean of a metric over the cells of one slice, with its bootstrap interval.
 
-    by  "part" (of `PARTS`), "joint" (the same, all agents together), or "horizon", "gap", "nearest", "age" with steps in
-        (above_steps, up_to_steps]
+    by  "part" (of `PARTS`), "joint" (the same, all agents together), "mission" (steps of which mission hypotheses tell, each
+        once), or "horizon", "gap", "nearest", "age" with steps in (above_steps, up_to_steps]
     """
 
     estimator: str
