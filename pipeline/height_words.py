@@ -3,6 +3,8 @@
 from collections.abc import Mapping
 from typing import Any, Final
 
+from pipeline.counted import counted
+
 DATA: Final[Mapping[str, str]] = {
     "ellipsoid": "above the WGS 84 ellipsoid",
     "sea level": "above sea level",
@@ -15,7 +17,7 @@ DATA: Final[Mapping[str, str]] = {
 
 def height_words(record: Mapping[str, Any]) -> str:
     """One sentence on the `height` record of extract's summary."""
-    words = f"heights of {record['num_detections']} detections are used, in metres {DATA[record['vertical_datum']]}"
+    words = f"heights are used of {counted(record['num_detections'], 'detection')}, in metres {DATA[record['vertical_datum']]}"
     if record["num_without"]:
         words += f"; {record['num_without']} have none"
     for noise in record["noise"]:

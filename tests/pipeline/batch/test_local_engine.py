@@ -104,6 +104,7 @@ def tell_blocked_signals(task, progress):
 
 def test_workers_never_hear_an_interrupt_and_we_do():
     """Not even one that comes while they and the process that forks them are only starting."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # where tests run in the background it may be ignored
     multiprocessing.forkserver._forkserver._stop()  # others may have started it
     (outcome,) = run_in_processes(bare_tasks(1), tell_blocked_signals, lambda task, told: None, 1)
     assert "SIGINT" in outcome.message.split(",")

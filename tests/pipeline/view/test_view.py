@@ -152,7 +152,9 @@ def test_several_missions_are_listed(served):
 
 def test_served_until_interrupted(tmp_path, served):
     folder, _ = served
-    words = [sys.executable, "-c", "import cli, sys; sys.exit(cli.main())", "view", str(folder), "--serve"]
+    # whoever runs the tests in the background may have had interrupts ignored, and children would inherit it
+    start = "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); import cli; sys.exit(cli.main())"
+    words = [sys.executable, "-c", start, "view", str(folder), "--serve"]
     environment = {**os.environ, "PYTHONPATH": str(Path(cli.__file__).parent)}
     with subprocess.Popen(words, stdout=subprocess.PIPE, text=True, env=environment, cwd=tmp_path) as process:
         line = process.stdout.readline()
@@ -164,7 +166,10 @@ def test_served_until_interrupted(tmp_path, served):
         assert answer.status == 200 and answer.read()
         connection.close()
         process.send_signal(signal.SIGINT)
-        assert process.wait(30) == 0
+        try:
+            assert process.wait(30) == 0
+        finally:
+            process.kill()
 
 
 def test_where_there_is_no_screen_nothing_is_opened(monkeypatch, tmp_path):
