@@ -15,6 +15,7 @@ from pipeline.ask.words import area_words
 from pipeline.lengths import metres
 
 _MANY = 20
+_UNPROVEN = "Mission hypotheses may be too sure where gaps are long; `cadence evaluate` says how sure, where there is truth."
 
 
 def ask(directory: Path, question: Question, out: Path | None = None, as_json: bool = False) -> str:
@@ -40,6 +41,8 @@ def _as_text(known: Known, found: Sequence[Answer], paths: Sequence[Path]) -> st
     equal = "" if effective > 0.99 * stories.num_hypotheses else f", of unequal weight, as good as {effective:.0f} equal ones"
     moment = "" if known.as_of_ns is None else f" as of {known.clock.moment(known.as_of_ns)}"
     lines.append(f"From {stories.num_hypotheses} stories{equal}{moment}; in brackets what more of them could say.")
+    if known.as_of_ns is None:
+        lines.append(_UNPROVEN)
     return "\n".join([*lines, *map(str, paths)])
 
 
