@@ -498,7 +498,7 @@ def same(
 
 @questions.command()
 def searched(context: typer.Context, as_json: Json = False) -> None:
-    """How much of where it may have been the sensors swept; needs their footprints."""
+    """How much of where it may have been the sensors swept; not answered yet."""
     _answer(context, as_json, ask="searched")
 
 

@@ -28,6 +28,7 @@ from pipeline.ask.words import (
 )
 from pipeline.clock import duration
 from pipeline.lengths import metres
+from pipeline.look_files import SENSORS_NAME
 from pipeline.plain_rows import without_nan
 
 
@@ -75,8 +76,14 @@ def answers(known: Known, question: Question) -> tuple[Answer, ...]:
 
 def refuse_unanswerable(directory: Path, question: Question) -> None:
     """`InputError` where no results of the log could answer the question."""
-    if question.ask == "searched":
-        raise InputError(f"{directory}: the log states no footprints of its sensors, so that nobody can say what was searched")
+    if question.ask != "searched":
+        return
+    if (directory / SENSORS_NAME).is_file():
+        raise InputError(
+            f"{directory}: how much the sensors searched is not answered yet; the report's maps show what they covered, "
+            "and where they saw nothing weighs the hypotheses of windows"
+        )
+    raise InputError(f"{directory}: the log states no footprints of its sensors, so that nobody can say what was searched")
 
 
 def _rank(answer: Answer) -> tuple[float, tuple[str, ...]]:

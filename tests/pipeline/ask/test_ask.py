@@ -249,3 +249,13 @@ def test_files_are_for_where_only(directory, tmp_path):
 
     with pytest.raises(UsageError, match="--out is for"):
         spoken(directory, Question("inside", area="mast"), tmp_path)
+
+
+def test_footprints_alone_do_not_say_what_was_searched(placed, capsys):
+    sensors = placed / "sensors.json"
+    sensors.write_text("{}", encoding="utf-8")
+    try:
+        got, out, err = ask(capsys, placed, "searched")
+    finally:
+        sensors.unlink()
+    assert got == 3 and not out and "is not answered yet" in err and "no footprints" not in err
