@@ -1,10 +1,11 @@
 """Mission hypotheses: joint tracks of all agents over a whole mission, one continuous path an agent and hypothesis."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from cadence.arrays import Bools, Float64s
+from cadence.arrays import Bools, Float64s, Indices
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,21 +54,29 @@ class Stories:
             raise ValueError(f"no agent {name!r}; there are {', '.join(self.agent_ids)}")
         return self.agent_ids.index(name)
 
+    def of(self, agents: Sequence[int]) -> "Stories":
+        """The stories of the agents with these numbers alone; heights stay behind."""
+        names = tuple(self.agent_ids[agent] for agent in agents)
+        return replace(self, position_m=self.position_m[:, list(agents)], agent_ids=names, height_m=None)
+
     def at(self, time_s: Float64s) -> Float64s:
         """Positions [K, A, len(time_s), 2] at other times, linear between two steps; NaN outside the stories' times."""
-        steps = self.time_s
-        right = np.clip(np.searchsorted(steps, time_s, side="left"), 1, max(len(steps) - 1, 1))
-        if len(steps) == 1:
-            share, left, right = np.zeros(len(time_s)), np.zeros(len(time_s), np.intp), np.zeros(len(time_s), np.intp)
-        else:
-            left = right - 1
-            share = (time_s - steps[left]) / (steps[right] - steps[left])
-        before, after = self.position_m[:, :, left], self.position_m[:, :, right]
-        # a step that is met exactly must not be lost to a neighbour where the agent is absent
-        mixed = np.where(
-            (share == 0)[:, None], before, np.where((share == 1)[:, None], after, before + share[:, None] * (after - before))
-        )
-        outside = (time_s < steps[0]) | (time_s > steps[-1])
-        mixed[:, :, outside] = np.nan
-        result: Float64s = mixed
-        return result
+        left, right, share = steps_around(self.time_s, time_s)
+        there = between_steps(self.position_m[:, :, left], self.position_m[:, :, right], share)
+        there[:, :, (time_s < self.time_s[0]) | (time_s > self.time_s[-1])] = np.nan
+        return there
+
+
+def steps_around(steps_s: Float64s, time_s: Float64s) -> tuple[Indices, Indices, Float64s]:
+    """The steps before and after times [M], and how far between them each is, 0 to 1; the nearest end outside of all steps."""
+    right = np.clip(np.searchsorted(steps_s, time_s), min(1, len(steps_s) - 1), len(steps_s) - 1)
+    left = np.maximum(right - 1, 0)
+    length_s = np.where(right > left, steps_s[right] - steps_s[left], 1.0)
+    return left, right, np.clip((time_s - steps_s[left]) / length_s, 0.0, 1.0)
+
+
+def between_steps(before: Float64s, after: Float64s, share: Float64s) -> Float64s:
+    """Positions [..., M, 2] on straight lines, at shares [M]; a step that is met exactly is not lost beside an absence."""
+    part = share[:, None]
+    mixed: Float64s = np.where(part == 0, before, np.where(part == 1, after, before + part * (after - before)))
+    return mixed

@@ -9,7 +9,7 @@ from cadence.answers.estimates import Law, Probability, law, probability
 from cadence.answers.visits import Visits, between, visits
 from cadence.answers.whereabouts import medoid
 from cadence.arrays import Bools, Float64s, Indices
-from cadence.stories import Stories
+from cadence.stories import Stories, between_steps, steps_around
 
 Span = tuple[float, float]
 """From when to when, seconds of the stories' clock."""
@@ -227,15 +227,9 @@ def _place(
     if not is_there.any():
         return None, None
     chosen, at_s = track_m[is_there], at_s[is_there]
-    right = np.clip(np.searchsorted(time_s, at_s), 1, max(len(time_s) - 1, 1)) if len(time_s) > 1 else np.zeros(len(at_s), int)
-    left = np.maximum(right - 1, 0)
+    left, right, share = steps_around(time_s, at_s)
     rows = np.arange(len(at_s))
-    length = np.where(right > left, time_s[right] - time_s[left], 1.0)
-    share = (at_s - time_s[left]) / length
-    before, after = chosen[rows, left], chosen[rows, right]
-    point = np.where(
-        (share >= 1)[:, None], after, np.where((share <= 0)[:, None], before, before + share[:, None] * (after - before))
-    )
+    point = between_steps(chosen[rows, left], chosen[rows, right], share)
     known = np.isfinite(point).all(-1)
     if not known.any():
         return None, None

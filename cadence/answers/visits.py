@@ -71,10 +71,7 @@ def between(stories: Stories, agents: tuple[int, ...], from_s: float, to_s: floa
 
     Only these agents' positions are copied: those of all agents of a long mission may fill the memory.
     """
-    chosen = replace(
-        stories, position_m=stories.position_m[:, list(agents)], agent_ids=tuple(stories.agent_ids[a] for a in agents),
-        height_m=None,
-    )  # fmt: skip
+    chosen = stories.of(agents)
     first, last = max(from_s, float(stories.time_s[0])), min(to_s, float(stories.time_s[-1]))
     if not first <= last:
         raise ValueError(f"nothing is known between {from_s:g} s and {to_s:g} s")

@@ -90,7 +90,7 @@ class _Draws:
             time_s = (_time_ns(self.case, b) - self.found.start_ns) * 1e-9
             for number, name in enumerate(stories.agent_ids):
                 if name in windows.agent_ids:
-                    at = stories.at(np.clip(time_s, *span_s[number]))[:, number] - windows.datum_m[b]
+                    at = stories.of([number]).at(np.clip(time_s, *span_s[number]))[:, 0] - windows.datum_m[b]
                     position[row, :, windows.agent_ids.index(name)] = at
         weight = torch.from_numpy(np.broadcast_to(stories.weight, (len(index), k)).copy())
         status = tuple(tuple("ok" for _ in windows.agent_ids) for _ in range(len(index)))

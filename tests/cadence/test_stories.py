@@ -52,3 +52,11 @@ def test_an_agent_is_found_by_its_name():
 def test_shapes_and_sums_are_checked(change, complaint):
     with pytest.raises(ValueError, match=complaint):
         Stories(**{**vars(two_stories()), **change})
+
+
+def test_stories_of_some_agents_are_theirs_alone():
+    position_m = np.arange(24.0).reshape(2, 3, 2, 2)
+    stories = Stories(np.array([0.0, 1.0]), position_m, np.array([0.5, 0.5]), ("a", "b", "c"), position_m[..., 0])
+    chosen = stories.of([2, 0])
+    assert chosen.agent_ids == ("c", "a") and chosen.height_m is None
+    assert np.array_equal(chosen.position_m, position_m[:, [2, 0]])
