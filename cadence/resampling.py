@@ -13,6 +13,12 @@ def candidates_at(weight: Float64s, share: Float64s) -> Int64s:
     return np.asarray(np.minimum(found, last_used), dtype=np.int64)
 
 
+def effective_number(weight: Float64s) -> float:
+    """How many of equal weight tell as much as those of weights [K], which need not sum to one (Kish 1965); 0 without any."""
+    squared = float(np.square(weight).sum())
+    return float(weight.sum()) ** 2 / squared if squared > 0 else 0.0
+
+
 def systematic(weight: Float64s, num: int, uniform: float) -> Int64s:
     """Indices [num], ascending, evenly spaced along the cumulated weights [M].
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from cadence.arrays import Bools, Float64s
+from cadence.resampling import effective_number
 
 LEVEL = 0.95
 """Of Monte Carlo intervals."""
@@ -45,12 +46,6 @@ class Law:
     median_low: float
     median_high: float
     num_effective: float
-
-
-def effective_number(weight: Float64s) -> float:
-    """Effective number of stories of weights [K], which need not sum to one; 0 without any."""
-    squared = float(np.square(weight).sum())
-    return float(weight.sum()) ** 2 / squared if squared > 0 else 0.0
 
 
 def probability(weight: Float64s, is_so: Bools) -> Probability:

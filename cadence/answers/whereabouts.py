@@ -14,8 +14,9 @@ import contourpy
 import numpy as np
 import shapely
 
-from cadence.answers.estimates import Probability, effective_number, probability, wilson
+from cadence.answers.estimates import Probability, probability, wilson
 from cadence.arrays import Float64s
+from cadence.resampling import effective_number
 
 LEVELS = (0.5, 0.9, 0.95)
 _MAX_PAIRS = 4_000_000

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from cadence.arrays import Float64s, Int64s
-from cadence.resampling import resample, systematic
+from cadence.resampling import effective_number, resample, systematic
 
 _SHARES = (0.0, 0.25, 0.5, 0.75, 1.0)
 ENOUGH = 0.5
@@ -36,7 +36,7 @@ def choose_together(log_weight: Float64s, num: int, uniform: float) -> Choice:
     """
     weight = _normalised(log_weight)
     if len(weight) == num:
-        return Choice(np.arange(num)[:, None], weight, np.array([_effective(weight)]))
+        return Choice(np.arange(num)[:, None], weight, np.array([effective_number(weight)]))
     for share in _SHARES:
         drawn_by = _normalised(share * log_weight if share else np.zeros_like(log_weight))
         index, kept = _taken(drawn_by, num, uniform)
@@ -72,7 +72,7 @@ def choose_apart(log_weight: Float64s, num: int, generator: np.random.Generator)
             taken = [systematic(drawn_by[:, agent], num, float(uniform[agent])) for agent in range(len(uniform))]
             index = np.take_along_axis(np.stack(taken, axis=1), order, axis=0)
         rest = np.prod(np.take_along_axis(weight / weight.max(axis=0), index, axis=0) ** (1.0 - share), axis=1)
-        if rest.any() and _effective(rest / rest.sum()) >= ENOUGH * num:
+        if effective_number(rest) >= ENOUGH * num:
             break
     rest = rest / rest.sum()
     return Choice(index, rest, np.array([_distinct_effective(column, rest) for column in index.T]))
@@ -98,10 +98,6 @@ def _normalised(log_weight: Float64s) -> Float64s:
     return np.asarray(weight / weight.sum(), dtype=np.float64)
 
 
-def _effective(weight: Float64s) -> float:
-    return float(1.0 / (weight**2).sum())
-
-
 def _distinct_effective(index: Int64s, weight: Float64s) -> float:
     """Effective sample size where the same candidate, taken several times, is one."""
-    return _effective(np.bincount(index, weights=weight).astype(np.float64))
+    return effective_number(np.bincount(index, weights=weight).astype(np.float64))

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from cadence.errors import UsageError
+from cadence.resampling import effective_number
 from pipeline.ask.answers import Answer, answers, refuse_unanswerable
 from pipeline.ask.files import write_places
 from pipeline.ask.known import Known, open_known
@@ -37,7 +38,7 @@ def _as_text(known: Known, found: Sequence[Answer], paths: Sequence[Path]) -> st
     if len(found) > _MANY:
         lines.append(f"{len(found) - _MANY} more; --json has all")
     stories = known.stories
-    effective = 1.0 / float((stories.weight**2).sum())
+    effective = effective_number(stories.weight)
     equal = "" if effective > 0.99 * stories.num_hypotheses else f", of unequal weight, as good as {effective:.0f} equal ones"
     moment = "" if known.as_of_ns is None else f" as of {known.clock.moment(known.as_of_ns)}"
     lines.append(f"From {stories.num_hypotheses} stories{equal}{moment}; in brackets what more of them could say.")

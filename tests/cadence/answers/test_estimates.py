@@ -5,7 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from cadence.answers.estimates import effective_number, law, probability, quantiles, wilson
+from cadence.answers.estimates import law, probability, quantiles, wilson
+from cadence.resampling import effective_number
 
 
 def test_of_300_stories_without_it_less_than_one_per_cent_is_said():
