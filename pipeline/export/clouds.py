@@ -54,7 +54,7 @@ def plan_clouds(
     fixes = (
         _chosen([num * _FIX_BYTES for num in num_fixes], _FIXES_SHARE * hypothesis_bytes) if is_georeferenced else frozenset()
     )
-    # Rerun 0.41 drops a whole topic for one message without fixes: its times are those of the fixes.
+    # For one message without fixes Rerun 0.41 drops the whole file (findings/fixes.sh).
     return CloudPlan(clouds, frozenset(index for index in fixes if num_fixes[index]))
 
 
