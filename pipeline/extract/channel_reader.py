@@ -5,6 +5,7 @@ What cannot be used is counted, never passed on in silence.
 
 import json
 import math
+from array import array
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -45,9 +46,11 @@ class ChannelReader:
     def __init__(self, channel: Channel, source: SourceConfig, role: str, is_stated: bool, named: Mapping[str, str]) -> None:
         paths = resolve_paths(source, channel.schema_name)
         self.channel, self.source, self.role, self.is_stated = channel, source, role, is_stated
-        self.is_geodetic = bool(paths.latitude)
+        if paths.is_polar and role != "detections":
+            raise ConfigError(f"extract.{role}, topic {channel.topic}: ranges and bearings are detections; name other topics")
+        self.paths, self.is_polar, self.is_geodetic = paths, paths.is_polar, bool(paths.latitude)
         self.names = {"agent": named.get("agent", source.agent), "sensor": named.get("sensor", source.sensor)}
-        names = _GEODETIC if self.is_geodetic else _METRIC
+        names = _POLAR if self.is_polar else _GEODETIC if self.is_geodetic else _METRIC
         alternatives = [getattr(paths, name) for name in names]
         self.alternatives, self.json_text = paths.alternatives, paths.json_text
         if self.alternatives == "first":
@@ -57,7 +60,8 @@ class ChannelReader:
                 tuple(self._field(name, (text,)) for name, text in zip(names, texts, strict=True))
                 for texts in zip(*alternatives, strict=True)
             ]
-        fields = {name: self._field(name, getattr(paths, name)) for name in _OTHERS}
+        self.more = _SIGMAS if self.is_polar else ()
+        fields = {name: self._field(name, getattr(paths, name)) for name in (*_OTHERS, *self.more)}
         self.fields = {name: reader for name, reader in fields.items() if reader.paths}
         self.conditions = Conditions(paths.where, source.where is not None)
         self.vertical_datum: VerticalDatum = paths.vertical_datum
@@ -65,7 +69,7 @@ class ChannelReader:
             self.vertical_datum = "frame"
         self.is_ned, self.is_north_first = paths.frame_convention == "ned", paths.is_north_first
         self.unknown = NONE_COVARIANCE if source.sigma_m is None else isotropic(source.sigma_m**2)
-        self.rows = Rows()
+        self.rows, self._measured = Rows(), array("d")
         self.counts: Counter[str] = Counter()
 
     def _field(self, name: str, paths: Sequence[str]) -> FieldReader:
@@ -75,7 +79,7 @@ class ChannelReader:
         if name == "time" and self.source.time in (LOG_TIME, PUBLISH_TIME):
             return FieldReader(())
         is_stated = getattr(self.source, PATH_KEYS.get(name, name), None) is not None
-        is_position = name in ("x", "y", "latitude", "longitude") and self.source.message_type is not None and self.is_stated
+        is_position = name in _NEEDED and self.source.message_type is not None and self.is_stated
         return FieldReader(paths, bool(paths) and (is_stated or is_position), _CONVERSIONS.get(name))
 
     def read(self, message: Any, raw: RawMessage) -> None:
@@ -94,7 +98,7 @@ class ChannelReader:
             if not self.conditions.hold_at(conditions, place):
                 self.counts[self._unmet] += 1
                 continue
-            values: dict[str, Any] = dict.fromkeys(_OTHERS)
+            values: dict[str, Any] = dict.fromkeys((*_OTHERS, *self.more))
             for name, located in found:
                 values[name] = located[place] if place in located else at_place(located, place)
             covariance = self._covariance(values["covariance"], values["covariance_type"], values["sigma"])
@@ -102,6 +106,7 @@ class ChannelReader:
             time_ns = default_ns if values["time"] is None else values["time"]
             self.rows.integers.extend((time_ns, raw.log_time_ns, raw.sequence, self.counts["messages"]))
             self.rows.floats.extend((_number(first), _number(second), _number(z), _number(values["score"]), *covariance))
+            self._measured.extend(_number(values[name]) for name in self.more)
             self.rows.agents.append(self._identity("agent", values["agent"], place))
             self.rows.sensors.append(self._identity("sensor", values["sensor"], place))
             self.rows.frame_ids.append(values["frame_id"] or "")
@@ -114,7 +119,7 @@ class ChannelReader:
 
     def field_columns(self) -> FieldColumns:
         """What reads the source's fields of many messages at once; `UndecodableChannel` where that cannot be done."""
-        if self.alternatives != "first" or self.json_text or self.conditions.name_constants:
+        if self.is_polar or self.alternatives != "first" or self.json_text or self.conditions.name_constants:
             raise UndecodableChannel(f"{self.channel.topic}: only a decoded message says what is to be used of it")
         readers = dict(zip(_COLUMNS, self.positions[0], strict=True)) | self.fields
         columns = FieldColumns(self.channel, {name: reader.paths for name, reader in readers.items()} | self.conditions.paths)
@@ -160,8 +165,12 @@ class ChannelReader:
             where = f"extract.{self.role}, topic {self.channel.topic}"
             raise ConfigError(f"{where}: no message has {self.conditions.missing}; correct `where` in the [extract] entry")
 
+    def sigmas(self) -> Float64s:
+        """Of all rows read the standard deviations of range, bearing and elevation [N, 3] as messages state them, else NaN."""
+        return np.array(self._measured, dtype=np.float64).reshape(-1, len(_SIGMAS))
+
     def finish(self) -> Positions:
-        """All rows read."""
+        """All rows read; of ranges and bearings range, bearing and elevation are x, y and z (see `polar`)."""
         rows = self.rows.finish(self.channel.topic, self.is_geodetic, self.is_ned, self.is_stated)
         if not self.is_north_first:
             return rows
@@ -238,6 +247,9 @@ def _frame_name(value: Any) -> str | None:
 _COLUMNS = ("first", "second", "z")
 _METRIC = ("x", "y", "z")
 _GEODETIC = ("latitude", "longitude", "altitude")
+_POLAR = ("range", "bearing", "elevation")
+_SIGMAS = ("range_sigma", "bearing_sigma", "elevation_sigma")
+_NEEDED = ("x", "y", "latitude", "longitude", "range", "bearing")
 _OTHERS = ("covariance", "covariance_type", "sigma", "time", "frame_id", "agent", "sensor", "score")
 _CONVERSIONS: Mapping[str, Callable[[Any], Any]] = {"time": stamp_ns, "frame_id": _frame_name}
 

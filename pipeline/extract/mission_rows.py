@@ -18,7 +18,9 @@ from pipeline.extract.hemispheres import check_hemispheres
 from pipeline.extract.joined import check_joined
 from pipeline.extract.mission_clock import on_one_clock
 from pipeline.extract.names import Naming, without_false_names
+from pipeline.extract.observers import from_observer
 from pipeline.extract.placement import Placing, bring_together, datum_of_transforms, in_enu, mission_frame, place
+from pipeline.extract.polar import read_rows
 from pipeline.extract.positions import Positions, Rows
 from pipeline.extract.reuse import without_reused_names
 from pipeline.extract.selection import ROLES
@@ -48,12 +50,20 @@ def rows_in_frame(
     transforms: LogTransforms,
 ) -> tuple[dict[str, Positions], Frame]:  # fmt: skip
     """The rows of every role, placed in the mission frame and thinned, and that frame."""
-    parts = {role: [(reader, reader.finish()) for reader in readers if reader.role == role] for role in ROLES}
+    parts = {role: [(reader, read_rows(reader, suspicions)) for reader in readers if reader.role == role] for role in ROLES}
     parts = without_set_back(parts, suspicions)
     if counts["steps_back"] and config.start is None and config.end is None:
         parts = without_set_back_unnumbered(parts, log, suspicions)
     parts = {role: _numbered(found) for role, found in parts.items()}
     timed, clock = on_one_clock(parts, suspicions)
+    limits = Limits(config.max_extrapolation_s, config.max_transform_gap_s)
+    if any(reader.source.has_observer for reader, _ in parts["detections"]):
+        about = [each for _, each in _in_place("poses", parts["poses"], timed["poses"], suspicions)]
+        poses = Positions.concatenate(about or [Rows().finish()])
+        timed["detections"] = [
+            from_observer(reader.source, each, poses, limits, counts) if reader.source.has_observer else each
+            for (reader, _), each in zip(parts["detections"], timed["detections"], strict=True)
+        ]
     placed = {role: _in_place(role, parts[role], timed[role], suspicions) for role in ROLES}
     check_hemispheres(placed, config.datum, suspicions)
     rows = {role: _columns([each for _, each in placed[role]], counts) for role in ROLES}
@@ -61,7 +71,7 @@ def rows_in_frame(
     _check_any(primary, rows[primary], counts, suspicions)
     rows = without_unjoined(rows, primary, suspicions)
     _check_span(primary, rows[primary])
-    placing = Placing(config.frame, Limits(config.max_extrapolation_s, config.max_transform_gap_s))
+    placing = Placing(config.frame, limits)
     read_tree = partial(transforms.read, clock)
     if config.frame is None:
         check_joined(rows, primary, transforms, read_tree, log, suspicions)
@@ -138,6 +148,11 @@ def _check_any(role: str, rows: Positions, counts: Counter[str], suspicions: Sus
     elif counts["no_transform"]:
         reason = (
             f"for none of the {role} the log has a transform near enough in time; "
+            "raise extract.max_extrapolation_s and extract.max_transform_gap_s, or check the stamps"
+        )
+    elif counts["no_observer"]:
+        reason = (
+            f"for none of the {role} the log has a pose of their observer near enough in time; "
             "raise extract.max_extrapolation_s and extract.max_transform_gap_s, or check the stamps"
         )
     elif counts["text"] and counts["text"] == counts["dropped_nonfinite"]:

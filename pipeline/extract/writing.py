@@ -22,6 +22,7 @@ from pipeline.extract.logged_sensors import logged_sensors
 from pipeline.extract.looks import collect_looks
 from pipeline.extract.mission_rows import rows_in_frame
 from pipeline.extract.obstacle_sources import collect_obstacles
+from pipeline.extract.polar import assumed
 from pipeline.extract.positions import Positions
 from pipeline.extract.reading import read_positions
 from pipeline.extract.selection import select_readers, selected_channels, unused_channels
@@ -76,7 +77,8 @@ def write_tables(log: MissionLog, folder: Path, config: ExtractConfig, progress:
     unused = unused_channels(readers, channels)
     tell(counts, suspicions, detections.positions, log, progress)
     records = [accuracy.record() for accuracy in accuracies]
-    for line in few(lines(records)):
+    taken = [line for reader in readers if (line := assumed(reader)) is not None]
+    for line in few([*lines(records), *taken]):
         progress.note(f"extract: {line}")
     for line in heights.remarks:
         progress.note(f"extract: {line}")
@@ -129,6 +131,7 @@ def _with_accuracy(
 ) -> tuple[Positions, list[Accuracy]]:
     """Detections with a covariance where they state none, and the user or their likelihood does; what the latter found."""
     stated = {reader.channel.topic for reader in readers if reader.source.sigma_m is not None}
+    stated |= {r.channel.topic for r in readers if r.is_stated and r.source.bearing_sigma_deg is not None}
     kinds = {reader.channel.topic: reader.channel.schema_name for reader in readers}
     rows, found = with_accuracy(rows, stated, config.default_sigma_m is not None, kinds, suspicions)
     if config.default_sigma_m is None:

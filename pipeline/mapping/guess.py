@@ -32,6 +32,7 @@ OWN_TOPICS = "/cadence/"
 # Of a type that is not known only a name as plain as this makes a detection: /radar/image or /battery/report are none.
 _PLAIN_DETECTION = {"contact", "contacts", "detection", "detections", "target", "targets", "sighting", "sightings"}
 _DETECTION_TYPE = re.compile(r"Detection|Detected|Track(?!er)|Object|Contact|Targets|Sighting|Radar|BoundingBox|AIS|Ais|ADSB")
+_SPARE: Final = "returns of a radar are used by themselves only where there are no other detections, which may be made of them"
 _NEVER_POSITIONS = {"std_msgs", "sensor_msgs", "rcl_interfaces", "diagnostic_msgs", "visualization_msgs"}
 
 
@@ -75,14 +76,19 @@ def suggest_mapping(channels: Sequence[ChannelLike]) -> SuggestedMapping:
     def readable(role: Role) -> list[ChannelLike]:
         return [c for c in channels if roles.get(c.topic) == role and usable_type(c) and c.message_count != 0]
 
+    detecting = readable("detections")
+    positions = [channel for channel in detecting if not _is_polar(channel)]
+    spare = [channel for channel in detecting if positions and channel not in positions]
+    used = positions or detecting
+    unused = {c.topic: why for c in channels if c.message_count != 0 and (why := _why_unused(c, roles.get(c.topic)))}
     return SuggestedMapping(
         roles,
-        detections=_name_only_agent(_sources(readable("detections"), "detections"), readable("detections"), readable("truth")),
+        detections=_name_only_agent(_sources(used, "detections"), used, readable("truth")),
         truth=_sources(readable("truth"), "truth"),
         poses=_sources(readable("poses"), "poses"),
         positions=_sources(readable("positions"), "positions"),
         unread=tuple(_unread_source(c) for c in channels if roles.get(c.topic) == "detections" and not usable_type(c)),
-        unused={c.topic: why for c in channels if c.message_count != 0 and (why := _why_unused(c, roles.get(c.topic)))},
+        unused=unused | {channel.topic: _SPARE for channel in spare},
     )
 
 
@@ -154,7 +160,7 @@ def _why_unused(channel: ChannelLike, role: Role | None) -> str | None:
     if _is_setpoint(channel) or _may_be_setpoint(channel.topic):
         return "it may be where a vehicle is told to go"
     if normalise_schema(channel.schema_name) in POLAR:
-        return "ranges and bearings are not used; tracks or objects of the same radar, in metres, would be"
+        return "its ranges and bearings are used only where a source states their paths"
     if type_of_schema(channel.schema_name) is not None:
         return "what is drawn may be anything"
     return "its type is not known"
@@ -173,7 +179,17 @@ def _sources(channels: Sequence[ChannelLike], role: Role) -> tuple[SourceConfig,
     """One source a pattern: topics of one type that differ only in a name share it."""
     topics = [channel.topic for channel in channels]
     found = {(pattern_of(c.topic, role, not _holds_several(c), topics), usable_type(c)): None for c in channels}
-    return tuple(SourceConfig(pattern, message_type=known) for pattern, known in found)
+    return tuple(_source(pattern, known) for pattern, known in found)
+
+
+def _source(pattern: str, known: str | None) -> SourceConfig:
+    """A source of a known type; of ranges and bearings with the accuracy that is taken, so that everybody sees it."""
+    if known is None or not MESSAGE_TYPES[known].is_polar:
+        return SourceConfig(pattern, message_type=known)
+    taken = MESSAGE_TYPES[known]
+    return SourceConfig(
+        pattern, message_type=known, range_sigma_m=taken.range_sigma_m, bearing_sigma_deg=taken.bearing_sigma_deg
+    )
 
 
 def _name_only_agent(
@@ -202,6 +218,11 @@ def _holds_several(channel: ChannelLike) -> bool:
 def _names_agents(channel: ChannelLike) -> bool:
     known = usable_type(channel)
     return known is not None and MESSAGE_TYPES[known].names_agents
+
+
+def _is_polar(channel: ChannelLike) -> bool:
+    known = usable_type(channel)
+    return known is not None and MESSAGE_TYPES[known].is_polar
 
 
 def _entry(role: str, source: SourceConfig) -> str:

@@ -11,10 +11,14 @@ FRAME_PATHS: Paths = ("header.frame_id", "frame_id")
 
 PATHS: Final = (
     "x", "y", "z", "latitude", "longitude", "altitude", "covariance", "covariance_type", "sigma", "time", "frame_id", "agent",
-    "sensor", "score",
+    "sensor", "score", "range", "bearing", "elevation", "range_rate", "range_sigma", "bearing_sigma", "elevation_sigma",
+    "range_rate_sigma",
 )  # fmt: skip
 """The fields of a message type that are message paths."""
 
+AngleUnit = Literal["rad", "deg"]
+BearingConvention = Literal["math", "compass"]
+"""What a bearing counts from, and which way: from x (ahead, or east) towards y; or from north (or ahead) clockwise."""
 
 VerticalDatum = Literal["ellipsoid", "sea level", "ground", "start", "frame", "not stated"]
 """What heights count from: the WGS 84 ellipsoid, mean sea level, the ground below, where it began, the zero of their frame."""
@@ -22,12 +26,18 @@ VerticalDatum = Literal["ellipsoid", "sea level", "ground", "start", "frame", "n
 
 @dataclass(frozen=True)
 class MessageType:
-    """Message paths of one type: x and y (metres), or latitude and longitude (degrees); a message may lack all others.
+    """Message paths of one type: x and y (metres), latitude and longitude (degrees), or range and bearing.
+
+    A message may lack all others.
 
     covariance       of numbers, row-major, x (east) and y (north) first, m²: 1, 4, 9 or 36 of them, 6 or 21 of an upper
                      triangle, or 3 of a diagonal
     covariance_type  0 or a word with UNKNOWN: the covariance says nothing
     sigma            standard deviation of x and y in metres, where there is no covariance
+    range, bearing, elevation, range_rate  what a sensor measured from where it was, and their standard deviations (..._sigma)
+    range_sigma_m, bearing_sigma_deg, elevation_sigma_deg, range_rate_sigma_mps  where messages state none
+    bearing_unit     of bearing, elevation and their standard deviations
+    bearing_convention  what a bearing counts from
     where            conditions (see `conditions`); those hold whose fields a message has
     alternatives     of positions; "first": the first that a message has. "filled": item by item the first that is not zero.
                      "all": every one of them holds positions of its own
@@ -50,6 +60,20 @@ class MessageType:
     covariance: Paths = ()
     covariance_type: Paths = ()
     sigma: Paths = ()
+    range: Paths = ()
+    bearing: Paths = ()
+    elevation: Paths = ()
+    range_rate: Paths = ()
+    range_sigma: Paths = ()
+    bearing_sigma: Paths = ()
+    elevation_sigma: Paths = ()
+    range_rate_sigma: Paths = ()
+    range_sigma_m: float | None = None
+    bearing_sigma_deg: float | None = None
+    elevation_sigma_deg: float | None = None
+    range_rate_sigma_mps: float | None = None
+    bearing_unit: AngleUnit = "rad"
+    bearing_convention: BearingConvention = "math"
     where: tuple[str, ...] = ()
     time: Paths = TIME_PATHS
     frame_id: Paths = FRAME_PATHS
@@ -68,7 +92,12 @@ class MessageType:
     @property
     def is_array(self) -> bool:
         """Whether a message may hold several positions."""
-        return any("[:]" in path for path in (*self.x, *self.latitude))
+        return any("[:]" in path for path in (*self.x, *self.latitude, *self.range, *self.bearing))
+
+    @property
+    def is_polar(self) -> bool:
+        """Whether it states ranges or bearings and no positions."""
+        return bool(self.range or self.bearing)
 
 
 def metric(schema: str, *points: str) -> MessageType:

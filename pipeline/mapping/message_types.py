@@ -10,8 +10,9 @@ from pipeline.mapping.fix_types import FIXES
 from pipeline.mapping.message_type import MessageType
 from pipeline.mapping.object_types import OBJECTS
 from pipeline.mapping.pose_types import POSES
+from pipeline.mapping.radar_types import RADARS
 
-MESSAGE_TYPES: Final[dict[str, MessageType]] = {**POSES, **FIXES, **OBJECTS}
+MESSAGE_TYPES: Final[dict[str, MessageType]] = {**POSES, **FIXES, **OBJECTS, **RADARS}
 
 SETPOINTS: Final = {
     "mavros_msgs.GlobalPositionTarget", "mavros_msgs.PositionTarget", "px4_msgs.PositionSetpoint",
@@ -20,8 +21,8 @@ SETPOINTS: Final = {
 }  # fmt: skip
 """Types of where a vehicle is told to be."""
 
-POLAR: Final = {"radar_msgs.RadarScan", "radar_msgs.RadarReturn", "radar_msgs.RadarPoints", "radar_msgs.RadarPoint"}
-"""Types of ranges and bearings, which are not used."""
+POLAR: Final = {"radar_msgs.RadarReturn", "radar_msgs.RadarPoints", "radar_msgs.RadarPoint"}
+"""Types of ranges and bearings that are used only where a source states their paths: drafts, and parts of a scan."""
 
 
 def normalise_schema(name: str) -> str:

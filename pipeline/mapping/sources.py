@@ -8,7 +8,7 @@ from typing import Any, Literal, Protocol
 from cadence.errors import ConfigError
 from pipeline.mapping.conditions import parse_conditions
 from pipeline.mapping.message_path import parse_path
-from pipeline.mapping.message_type import PATHS, MessageType, VerticalDatum
+from pipeline.mapping.message_type import PATHS, AngleUnit, BearingConvention, MessageType, VerticalDatum
 from pipeline.mapping.message_types import MESSAGE_TYPES, type_of_schema
 
 PLACEHOLDERS = ("agent", "sensor")
@@ -20,8 +20,11 @@ PATH_KEYS = {"agent": "agent_path", "sensor": "sensor_path"}
 
 _CHECKED = (
     "agent_path", "sensor_path", "x", "y", "z", "latitude", "longitude", "altitude", "covariance", "sigma", "score", "time",
-    "frame_id",
+    "frame_id", "range", "bearing", "elevation", "range_sigma", "bearing_sigma", "elevation_sigma",
 )  # fmt: skip
+_POSITIVE = ("sigma_m", "sigma_z_m", "range_sigma_m", "bearing_sigma_deg", "elevation_sigma_deg")
+_MEASURED = {"range": "range_sigma_m", "bearing": "bearing_sigma_deg", "elevation": "elevation_sigma_deg"}
+"""What a sensor may have measured, and the setting that says how exactly where messages do not."""
 
 
 HeightUnit = Literal["m", "ft", "FL"]
@@ -57,6 +60,17 @@ class SourceConfig:
     sensor, sensor_path  who saw it
     x, y, z     message paths of a position in metres
     latitude, longitude, altitude   message paths of a position in degrees (and metres), instead of x, y and z
+    range, bearing, elevation   message paths of what a sensor measured from where it was, instead of x and y
+    range_sigma, bearing_sigma, elevation_sigma   message paths of their standard deviations, in the same units
+    range_sigma_m, bearing_sigma_deg, elevation_sigma_deg   standard deviations where messages state none
+    bearing_unit of bearing, elevation and their standard deviations: "rad" (default) or "deg"
+    bearing_convention   "math" (default): from the x axis of the sensor's frame (ahead, or east) towards y, as ROS has it;
+                "compass": clockwise from north
+    observer    the sensor of [[extract.poses]] from whose places it was measured; default: the origin of the frame that
+                frame_id names, at the stamp, by the log's transforms
+    observer_x_m, observer_y_m   where it was measured from, in the mission frame, where that stands
+    observer_latitude, observer_longitude   the same in degrees
+    observer_heading_deg   clockwise from north, where bearings of an observer count from ahead of it
     unit        of latitude and longitude: "deg", "rad", "1e-7 deg" or "ddmm.mm" (degrees and minutes, as NMEA 0183 has them);
                 of x, y and z: "m" (of a plane) or "ecef" (from the earth's centre); default: degrees or metres, but for what
                 can hardly be meant as such
@@ -99,6 +113,23 @@ class SourceConfig:
     height_unit: HeightUnit | None = None
     vertical_datum: VerticalDatum | None = None
     sigma_z_m: float | None = None
+    range: str | None = None
+    bearing: str | None = None
+    elevation: str | None = None
+    range_sigma: str | None = None
+    bearing_sigma: str | None = None
+    elevation_sigma: str | None = None
+    range_sigma_m: float | None = None
+    bearing_sigma_deg: float | None = None
+    elevation_sigma_deg: float | None = None
+    bearing_unit: AngleUnit | None = None
+    bearing_convention: BearingConvention | None = None
+    observer: str | None = None
+    observer_x_m: float | None = None
+    observer_y_m: float | None = None
+    observer_latitude: float | None = None
+    observer_longitude: float | None = None
+    observer_heading_deg: float | None = None
     score: str | None = None
     time: str | None = None
     frame_id: str | None = None
@@ -113,7 +144,7 @@ class SourceConfig:
                 _check(name, self.without_topic(text), parse_path)
         if self.where:
             _check("where", self.where, parse_conditions)
-        for name in ("sigma_m", "sigma_z_m"):
+        for name in _POSITIVE:
             value = getattr(self, name)
             if value is not None and not 0 < value < float("inf"):
                 raise ValueError(f"topic {self.topic!r}: {name} must be positive")
@@ -123,8 +154,26 @@ class SourceConfig:
     def _check_position(self) -> None:
         if (self.x is None) != (self.y is None) or (self.latitude is None) != (self.longitude is None):
             raise ValueError(f"topic {self.topic!r}: x and y (or latitude and longitude) go together")
-        if self.x is not None and self.latitude is not None:
-            raise ValueError(f"topic {self.topic!r}: give x and y, or latitude and longitude, not both")
+        kinds = [self.x is not None, self.latitude is not None, self.range is not None or self.bearing is not None]
+        if sum(kinds) > 1:
+            raise ValueError(f"topic {self.topic!r}: give only one of x and y, latitude and longitude, range and bearing")
+        if (self.range is None) != (self.bearing is None):
+            raise ValueError(f"topic {self.topic!r}: range and bearing go together; one alone is no position, and is not used")
+        for first, second in (("observer_x_m", "observer_y_m"), ("observer_latitude", "observer_longitude")):
+            if (getattr(self, first) is None) != (getattr(self, second) is None):
+                raise ValueError(f"topic {self.topic!r}: {first} and {second} go together")
+        places = [self.observer is not None, self.observer_x_m is not None, self.observer_latitude is not None]
+        if sum(places) > 1:
+            raise ValueError(f"topic {self.topic!r}: give only one of observer, observer_x_m and observer_latitude")
+        if self.observer_heading_deg is not None and not any(places):
+            raise ValueError(
+                f"topic {self.topic!r}: observer_heading_deg is of an observer; a frame's heading is in transforms"
+            )
+
+    @property
+    def has_observer(self) -> bool:
+        """Whether it says from where was measured, instead of a frame."""
+        return self.observer is not None or self.observer_x_m is not None or self.observer_latitude is not None
 
     def _check_identity(self) -> None:
         found = re.findall(r"\{(.*?)\}", self.topic)
@@ -150,12 +199,12 @@ class SourceConfig:
 
 def resolve_paths(source: SourceConfig, schema_name: str) -> MessageType:
     """The message paths for a schema: what the source states over its type; `ConfigError` where there is no position."""
-    is_custom = source.x is not None or source.latitude is not None
+    is_custom = any(path is not None for path in (source.x, source.latitude, source.range, source.bearing))
     name = source.message_type if source.message_type is not None or is_custom else type_of_schema(schema_name)
     if name is None and not is_custom:
         raise ConfigError(
             f"topic {source.topic}: its type, {schema_name or 'without a schema'}, is not known; "
-            "give message paths in its [extract] entry: x and y, or latitude and longitude"
+            "give message paths in its [extract] entry: x and y, latitude and longitude, or range and bearing"
         )
     base = MESSAGE_TYPES[name] if name is not None else MessageType(())
     if is_custom:  # another position must not take height or covariance from the type's
@@ -172,7 +221,32 @@ def resolve_paths(source: SourceConfig, schema_name: str) -> MessageType:
         stated["covariance_type"] = ()
     if source.where is not None:
         stated["where"] = (source.where,) if source.where else ()
-    return replace(base, **stated)
+    found = replace(base, **stated)
+    _check_measured(source, found)
+    return found
+
+
+def _check_measured(source: SourceConfig, found: MessageType) -> None:
+    """`ConfigError` where ranges and bearings lack what they need, or settings are of those and the source has none."""
+    where = f"topic {source.topic}"
+    if not found.is_polar:
+        names = [*_MEASURED, *_MEASURED.values(), "bearing_unit", "bearing_convention", "observer", "observer_x_m"]
+        unread = [name for name in (*names, "observer_latitude") if getattr(source, name) is not None]
+        if unread:
+            raise ConfigError(f"{where}: {unread[0]} is of ranges and bearings, and it has positions; leave it out")
+        return
+    unread = [name for name in ("sigma", "sigma_m", "covariance", "unit") if getattr(source, name) is not None]
+    if unread:
+        raise ConfigError(f"{where}: {unread[0]} is of positions; state range_sigma_m and bearing_sigma_deg instead")
+    for name, setting in _MEASURED.items():
+        has_sigma = getattr(found, f"{name}_sigma") or getattr(found, setting) is not None
+        if getattr(source, name) is not None and not has_sigma:
+            raise ConfigError(f"{where}: nothing says how exact its {name} is; give {setting}, or the path {name}_sigma")
+    if found.bearing_convention == "compass" and not source.has_observer:
+        raise ConfigError(
+            f"{where}: compass bearings are of a place, and nothing says which; give observer (a sensor of [[extract.poses]]), "
+            "observer_x_m and observer_y_m, or observer_latitude and observer_longitude"
+        )
 
 
 def _check(name: str, text: str, parse: Callable[[str], object]) -> None:

@@ -145,7 +145,7 @@ def test_channels_that_may_hold_detections_are_named(tmp_path: Path) -> None:
         "/lidar/objects (own.ObstacleDetections)": "its type is not known",
         "/fused (own_msgs/msg/TrackedObjectList)": "its type is not known",
         "/radar/detections (radar_msgs/msg/RadarScan)": (
-            "ranges and bearings are not used; tracks or objects of the same radar, in metres, would be"
+            "returns of a radar are used by themselves only where there are no other detections, which may be made of them"
         ),
         "/viz/targets (visualization_msgs/msg/MarkerArray)": "what is drawn may be anything",
     }

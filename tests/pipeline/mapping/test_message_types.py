@@ -297,4 +297,4 @@ def test_types_are_complete() -> None:
     for name, known in MESSAGE_TYPES.items():
         assert all(normalise_schema(schema) == schema for schema in known.schemas), name
         assert known.schemas or name == "AIS"  # JSON without a schema
-        assert bool(known.x) != bool(known.latitude), name
+        assert [bool(known.x), bool(known.latitude), known.is_polar].count(True) == 1, name
