@@ -72,6 +72,32 @@ LOOKS = pa.schema(
 )
 """One row per look of a sensor whose footprint is stated, whether it detected anybody or not."""
 
+MEASUREMENTS = pa.schema(
+    [
+        pa.field("log_id", pa.string(), nullable=False),
+        pa.field("time_ns", pa.int64(), nullable=False),
+        pa.field("sensor_id", pa.string()),
+        pa.field("agent_id", pa.string()),  # null = nobody knows whom it is about
+        pa.field("observer_x_m", pa.float64(), nullable=False),
+        pa.field("observer_y_m", pa.float64(), nullable=False),
+        pa.field("observer_z_m", pa.float64()),  # above the datum of the detections' heights; null where that is not known
+        pa.field("observer_vx_mps", pa.float64()),
+        pa.field("observer_vy_mps", pa.float64()),
+        pa.field("bearing_rad", pa.float64()),  # from east towards north; what was not measured is null, and so is its sigma
+        pa.field("bearing_sigma_rad", pa.float64()),
+        pa.field("elevation_rad", pa.float64()),  # up from the horizontal
+        pa.field("elevation_sigma_rad", pa.float64()),
+        pa.field("range_m", pa.float64()),  # straight to the target
+        pa.field("range_sigma_m", pa.float64()),
+        pa.field("range_rate_mps", pa.float64()),  # positive where the target recedes
+        pa.field("range_rate_sigma_mps", pa.float64()),
+        pa.field("topic", pa.string(), nullable=False),  # topic, log time and sequence as in DETECTIONS
+        pa.field("log_time_ns", pa.int64(), nullable=False),
+        pa.field("sequence", pa.int64(), nullable=False),
+    ]
+)
+"""One row per measurement of a target that is no position: a bearing, a range or a range rate, or both of too wide a beam."""
+
 WINDOWS = pa.schema(
     [
         pa.field("window", pa.int32(), nullable=False),

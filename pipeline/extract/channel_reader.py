@@ -60,7 +60,7 @@ class ChannelReader:
                 tuple(self._field(name, (text,)) for name, text in zip(names, texts, strict=True))
                 for texts in zip(*alternatives, strict=True)
             ]
-        self.more = _SIGMAS if self.is_polar else ()
+        self.more = MEASURED if self.is_polar else ()
         fields = {name: self._field(name, getattr(paths, name)) for name in (*_OTHERS, *self.more)}
         self.fields = {name: reader for name, reader in fields.items() if reader.paths}
         self.conditions = Conditions(paths.where, source.where is not None)
@@ -165,9 +165,10 @@ class ChannelReader:
             where = f"extract.{self.role}, topic {self.channel.topic}"
             raise ConfigError(f"{where}: no message has {self.conditions.missing}; correct `where` in the [extract] entry")
 
-    def sigmas(self) -> Float64s:
-        """Of all rows read the standard deviations of range, bearing and elevation [N, 3] as messages state them, else NaN."""
-        return np.array(self._measured, dtype=np.float64).reshape(-1, len(_SIGMAS))
+    def measured(self) -> Mapping[str, Float64s]:
+        """Of all rows read [N] what messages state beside range, bearing and elevation (`MEASURED`), else NaN."""
+        columns = np.array(self._measured, dtype=np.float64).reshape(-1, len(MEASURED)).T
+        return dict(zip(MEASURED, columns, strict=True))
 
     def finish(self) -> Positions:
         """All rows read; of ranges and bearings range, bearing and elevation are x, y and z (see `polar`)."""
@@ -194,6 +195,8 @@ class ChannelReader:
 
     def _joined(self, position: Sequence[FieldReader], message: Any) -> list[Point] | None:
         """The items that have both of the first two coordinates; the others are counted."""
+        if not (position[0].paths and position[1].paths):
+            return self._alone(position, message)
         firsts, seconds = position[0].located(message), position[1].located(message)
         if firsts is None or seconds is None:
             return None
@@ -201,6 +204,15 @@ class ChannelReader:
         points = [(place, first, seconds[place], at_place(zs, place)) for place, first in firsts.items() if place in seconds]
         self.counts["incomplete"] += len(firsts.keys() | seconds.keys()) - len(points)
         return points
+
+    def _alone(self, position: Sequence[FieldReader], message: Any) -> list[Point] | None:
+        """The items of a source of ranges without bearings, or of bearings without ranges."""
+        is_range = bool(position[0].paths)
+        found = position[0 if is_range else 1].located(message)
+        if found is None:
+            return None
+        zs = position[2].located(message) or {}
+        return [(place, *((value, None) if is_range else (None, value)), at_place(zs, place)) for place, value in found.items()]
 
     def _covariance(self, matrix: Any, kind: Any, sigma_m: Any) -> Covariance:
         """What is unknown takes the stated accuracy, else the source's sigma_m; so does what is none, which is counted."""
@@ -248,7 +260,8 @@ _COLUMNS = ("first", "second", "z")
 _METRIC = ("x", "y", "z")
 _GEODETIC = ("latitude", "longitude", "altitude")
 _POLAR = ("range", "bearing", "elevation")
-_SIGMAS = ("range_sigma", "bearing_sigma", "elevation_sigma")
+MEASURED = ("range_rate", "range_sigma", "bearing_sigma", "elevation_sigma", "range_rate_sigma")
+"""What sources of ranges and bearings may state beside these."""
 _NEEDED = ("x", "y", "latitude", "longitude", "range", "bearing")
 _OTHERS = ("covariance", "covariance_type", "sigma", "time", "frame_id", "agent", "sensor", "score")
 _CONVERSIONS: Mapping[str, Callable[[Any], Any]] = {"time": stamp_ns, "frame_id": _frame_name}

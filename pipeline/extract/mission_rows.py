@@ -2,7 +2,7 @@
 
 import itertools
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Final
 
@@ -20,10 +20,10 @@ from pipeline.extract.mission_clock import on_one_clock
 from pipeline.extract.names import Naming, without_false_names
 from pipeline.extract.observers import from_observer
 from pipeline.extract.placement import Placing, bring_together, datum_of_transforms, in_enu, mission_frame, place
-from pipeline.extract.polar import read_rows
 from pipeline.extract.positions import Positions, Rows
 from pipeline.extract.reuse import without_reused_names
 from pipeline.extract.selection import ROLES
+from pipeline.extract.sightings import SIGHTINGS, in_pairs, read_parts, together
 from pipeline.extract.spikes import is_spike
 from pipeline.extract.stages import without_other_stages
 from pipeline.extract.stretches import without_set_back, without_unjoined
@@ -44,30 +44,32 @@ _YEAR_S: Final = 365.25 * 86400
 _MAX_YEARS: Final = 100.0
 """Nobody records a mission for longer; windows of centuries reach beyond the times that files can state."""
 
+Parts = dict[str, list[tuple[ChannelReader, Positions]]]
+
 
 def rows_in_frame(
     log: MissionLog, readers: Sequence[ChannelReader], config: ExtractConfig, counts: Counter[str], suspicions: Suspicions,
     transforms: LogTransforms,
 ) -> tuple[dict[str, Positions], Frame]:  # fmt: skip
     """The rows of every role, placed in the mission frame and thinned, and that frame."""
-    parts = {role: [(reader, read_rows(reader, suspicions)) for reader in readers if reader.role == role] for role in ROLES}
+    parts: Parts = {role: [(reader, reader.finish()) for reader in readers if reader.role == role] for role in ROLES[1:]}
+    detections, sightings = read_parts([reader for reader in readers if reader.role == "detections"], suspicions)
+    parts = {"detections": detections, **parts} | ({SIGHTINGS: sightings} if sightings else {})
     parts = without_set_back(parts, suspicions)
     if counts["steps_back"] and config.start is None and config.end is None:
         parts = without_set_back_unnumbered(parts, log, suspicions)
     parts = {role: _numbered(found) for role, found in parts.items()}
     timed, clock = on_one_clock(parts, suspicions)
     limits = Limits(config.max_extrapolation_s, config.max_transform_gap_s)
-    if any(reader.source.has_observer for reader, _ in parts["detections"]):
-        about = [each for _, each in _in_place("poses", parts["poses"], timed["poses"], suspicions)]
-        poses = Positions.concatenate(about or [Rows().finish()])
-        timed["detections"] = [
-            from_observer(reader.source, each, poses, limits, counts) if reader.source.has_observer else each
-            for (reader, _), each in zip(parts["detections"], timed["detections"], strict=True)
-        ]
+    timed = _from_observers(parts, timed, limits, counts, suspicions)
     placed = {role: _in_place(role, parts[role], timed[role], suspicions) for role in ROLES}
     check_hemispheres(placed, config.datum, suspicions)
     rows = {role: _columns([each for _, each in placed[role]], counts) for role in ROLES}
+    if sightings:
+        rows[SIGHTINGS] = timed[SIGHTINGS][0]
     primary = "truth" if config.thinning.enabled and config.thinning.thin_from == "truth" else "detections"
+    if sightings and primary == "detections":
+        _check_drawable(rows, suspicions)
     _check_any(primary, rows[primary], counts, suspicions)
     rows = without_unjoined(rows, primary, suspicions)
     _check_span(primary, rows[primary])
@@ -80,14 +82,35 @@ def rows_in_frame(
     rows = {role: in_enu(positions) for role, positions in rows.items()}
     datum = config.datum or datum_of_transforms(rows[primary], read_tree)
     frame = mission_frame(rows[primary], [rows[role] for role in ROLES if role != primary], datum)
-    rows = {role: _placed(role, rows[role], frame, counts, transforms.apart) for role in ROLES}
+    rows = {role: _placed(role, found, frame, counts, transforms.apart) for role, found in rows.items()}
     rows["detections"] = _identified(rows["detections"], readers, config.simultaneity_s, suspicions)
-    rows = {role: _without_spikes(rows[role], config.max_speed_mps, counts) for role in ROLES}
+    rows |= {role: _without_spikes(rows[role], config.max_speed_mps, counts) for role in ROLES}
     if config.thinning.enabled:
         rows["detections"] = _thinned(rows[primary], config.thinning)
         if len(rows["detections"]) == 0:
             raise InputError("thinning left no detection; choose a smaller extract.thinning.mean_gap_s or another seed")
     return rows, frame
+
+
+def _from_observers(
+    parts: Parts, timed: dict[str, list[Positions]], limits: Limits, counts: Counter[str], suspicions: Suspicions
+) -> dict[str, list[Positions]]:
+    """The rows of every reader by role, those about an observer at its places; sightings all together, in pairs."""
+    found = dict(timed)
+    measuring = [role for role in ("detections", SIGHTINGS) if role in parts]
+    if SIGHTINGS in parts:
+        found[SIGHTINGS] = [in_pairs(rows) for rows in timed[SIGHTINGS]]
+    if any(reader.source.has_observer for role in measuring for reader, _ in parts[role]):
+        about = [each for _, each in _in_place("poses", parts["poses"], timed["poses"], suspicions)]
+        poses = Positions.concatenate(about or [Rows().finish()])
+        for role in measuring:
+            found[role] = [
+                from_observer(reader.source, each, poses, limits, counts) if reader.source.has_observer else each
+                for (reader, _), each in zip(parts[role], found[role], strict=True)
+            ]
+    if SIGHTINGS in parts:
+        found[SIGHTINGS] = [together(found[SIGHTINGS])]
+    return found
 
 
 def _identified(rows: Positions, readers: Sequence[ChannelReader], tolerance_s: float, suspicions: Suspicions) -> Positions:
@@ -177,6 +200,16 @@ def _check_any(role: str, rows: Positions, counts: Counter[str], suspicions: Sus
     raise InputError(reason)
 
 
+def _check_drawable(rows: Mapping[str, Positions], suspicions: Suspicions) -> None:
+    """`InputError` where nothing but bearings, or ranges, tells of anybody."""
+    num = len(rows[SIGHTINGS]) // rows[SIGHTINGS].PLACES
+    if num and not len(rows["detections"]) and not suspicions:
+        raise InputError(
+            f"{counted(num, 'measurement is', 'measurements are')} bearings or ranges alone, and no detection is a position: "
+            "from those alone no agent can be drawn yet; add a source of positions, or of ranges with bearings"
+        )
+
+
 def _check_span(role: str, rows: Positions) -> None:
     """`InputError` where sorted rows span more time than any mission."""
     years = float(rows.time_ns[-1] - rows.time_ns[0]) * 1e-9 / _YEAR_S
@@ -197,6 +230,7 @@ def _placed(role: str, rows: Positions, frame: Frame, counts: Counter[str], apar
         geodetic = {"latitude and longitude"} if (rows.is_geodetic & (not frame.is_georeferenced)).any() else set()
         apart |= geodetic | {str(name) for name in rows.frame_id[~rows.is_geodetic]} - {frame.frame_id, ""}
     if num_elsewhere and rows.is_stated.any():
+        role = "detections" if role == SIGHTINGS else role
         found = counted(num_elsewhere, "position is", "positions are")
         raise InputError(
             f"{role}: {found} not in the mission frame {frame.frame_id!r}, and no transform of the log "

@@ -46,7 +46,7 @@ def from_observer(source: SourceConfig, rows: Positions, poses: Positions, limit
     is_geodetic = bool(found.is_geodetic[0])
     second = np.unwrap(found.second, period=360.0) if is_geodetic else found.second
     about, is_known = _at(found.time_ns, np.column_stack([found.first, second, found.z_m]), rows.time_ns, limits)
-    counts["no_observer"] += int((~is_known).sum())
+    counts["no_observer"] += int((~is_known).sum()) // rows.PLACES
     return _moved(rows[is_known], about[is_known], is_geodetic, bool(found.is_ned[0]), str(found.frame_id[0]))
 
 

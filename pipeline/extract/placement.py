@@ -139,7 +139,8 @@ def place(positions: Positions, frame: Frame) -> tuple[Positions, int]:
     rows = placed.is_geodetic
     if rows.any():
         first[rows], second[rows] = to_local(frame, placed.first[rows], placed.second[rows])
-    return placed.changed(first=first, second=second, is_geodetic=np.zeros_like(rows)), int((~is_placed).sum())
+    num_elsewhere = int((~is_placed).sum()) // positions.PLACES
+    return placed.changed(first=first, second=second, is_geodetic=np.zeros_like(rows)), num_elsewhere
 
 
 def in_enu(positions: Positions) -> Positions:
@@ -164,8 +165,8 @@ def _moved(positions: Positions, target: str, tree: TransformTree, limits: Limit
         positions = _turned(positions, rows, motion.rotation, motion.translation_m)
         frame_id[rows] = target
         is_kept[rows] = motion.is_known
-        counts["transformed"] += int(motion.is_known.sum())
-        counts["no_transform"] += int((~motion.is_known).sum())
+        counts["transformed"] += int(motion.is_known.sum()) // positions.PLACES
+        counts["no_transform"] += int((~motion.is_known).sum()) // positions.PLACES
     return positions.changed(frame_id=frame_id)[is_kept]
 
 

@@ -1,17 +1,17 @@
-"""Ranges and bearings of a sensor → positions about it, with the covariance that they have (`cadence.measurement.polar`).
+"""Ranges and bearings as messages have them → metres and radians with their standard deviations, and positions of both.
 
 The axes are those of the sensor's frame, which transforms bring into the mission's; of a source that says where its observer
 was, east and north about that place (`observers`).
 """
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
 from cadence.arrays import Bools, Float64s
 from cadence.errors import ConfigError
-from cadence.measurement.polar import cartesian
+from cadence.measurement.polar import cartesian, is_nearly_normal
 from pipeline.extract.channel_reader import ChannelReader
 from pipeline.extract.positions import Positions
 from pipeline.suspicions import Suspicions
@@ -20,56 +20,79 @@ _LITTLE_MORE: Final = 1.01
 """Angles that are counted on over a full turn by a rounding are no degrees."""
 _MOST_SIGMA_RAD: Final = 0.35
 """Beyond 20 degrees a beam tells a side of the sensor and no position."""
+_UNITS: Final = {"range": "m", "bearing": "degrees", "elevation": "degrees", "range_rate": "m/s"}
+SETTINGS: Final = {
+    "range": "range_sigma_m", "bearing": "bearing_sigma_deg", "elevation": "elevation_sigma_deg",
+    "range_rate": "range_rate_sigma_mps",
+}  # fmt: skip
+"""The setting that says how exact a value is where messages do not."""
 
 
 @dataclass(frozen=True, eq=False)
 class Measured:
     """What one source measured [N]: metres, radians from x towards y and from there towards z, and standard deviations.
 
-    NaN stands for what cannot be meant. Of a source without elevations these are zero, as are their sigmas.
+    NaN stands for what is not measured, or cannot be meant.
     """
 
     range_m: Float64s
     bearing_rad: Float64s
     elevation_rad: Float64s
+    range_rate_mps: Float64s
     range_sigma_m: Float64s
     bearing_sigma_rad: Float64s
     elevation_sigma_rad: Float64s
-    has_elevation: bool
+    range_rate_sigma_mps: Float64s
+
+    def __getitem__(self, rows: Any) -> "Measured":
+        """The rows of a mask or of indices."""
+        return Measured(*(column[rows] for column in vars(self).values()))
+
+    @property
+    def is_place(self) -> Bools:
+        """Which rows [N] have a range and a bearing."""
+        return np.isfinite(self.range_m) & np.isfinite(self.bearing_rad)
+
+    @property
+    def is_bent(self) -> Bools:
+        """Which of these are no normal positions, as the beam is too wide."""
+        return self.is_place & ~is_nearly_normal(self.range_m, self.range_sigma_m, self.bearing_sigma_rad)
 
 
-def read_rows(reader: ChannelReader, suspicions: Suspicions) -> Positions:
-    """All rows of a reader as positions, in its frame or about its observer; what it states as positions as it is."""
-    rows = reader.finish()
-    if not reader.is_polar or not len(rows):
-        return rows
-    found = measured(reader, rows, suspicions)
+def as_positions(rows: Positions, found: Measured) -> Positions:
+    """The rows [N] as positions in the axes of their sensor; NaN where range or bearing are."""
+    has_elevation = np.isfinite(found.elevation_rad)
     place_m, covariance = cartesian(
-        found.range_m, found.bearing_rad, found.elevation_rad, found.range_sigma_m, found.bearing_sigma_rad,
-        found.elevation_sigma_rad,
+        found.range_m, found.bearing_rad, np.where(has_elevation, found.elevation_rad, 0.0), found.range_sigma_m,
+        found.bearing_sigma_rad, np.where(has_elevation, found.elevation_sigma_rad, 0.0),
     )  # fmt: skip
     flat, upright = covariance[:, [0, 0, 1], [0, 1, 1]], covariance[:, [0, 1, 2], [2, 2, 2]]
-    if not found.has_elevation:  # nobody knows how high: a tilted frame must not take that for exact
-        upright = np.column_stack([np.zeros((len(rows), 2)), flat[:, [0, 2]].mean(axis=1)])
-    z_m = place_m[:, 2] if found.has_elevation else np.full(len(rows), np.nan)
-    return rows.changed(first=place_m[:, 0], second=place_m[:, 1], z_m=z_m, covariance_m2=flat, height_covariance_m2=upright)
+    # nobody knows how high: a tilted frame must not take that for exact
+    unknown = np.column_stack([np.zeros((len(rows), 2)), flat[:, [0, 2]].mean(axis=1)])
+    return rows.changed(
+        first=place_m[:, 0], second=place_m[:, 1], z_m=np.where(has_elevation, place_m[:, 2], np.nan), covariance_m2=flat,
+        height_covariance_m2=np.where(has_elevation[:, None], upright, unknown),
+    )  # fmt: skip
 
 
 def measured(reader: ChannelReader, rows: Positions, suspicions: Suspicions) -> Measured:
     """What the rows [N] of a reader measured: range, bearing and elevation as messages have them are first, second and z."""
-    unit = _angle_unit(reader, rows, suspicions)
-    stated = reader.sigmas()
-    range_sigma, bearing_sigma, elevation_sigma = (
-        _sigma(reader, name, stated[:, column], unit if name != "range" else 1.0, suspicions)
-        for column, name in enumerate(("range", "bearing", "elevation"))
-    )
-    elevation = rows.z_m * unit
-    has_elevation = bool((np.nan_to_num(elevation) != 0).any())
-    if not has_elevation:  # a radar of two dimensions leaves it zero
-        elevation, elevation_sigma = np.zeros(len(rows)), np.zeros(len(rows))
+    unit, stated = _angle_unit(reader, rows, suspicions), reader.measured()
     range_m = np.where(_is_distance(reader, rows, suspicions), rows.first, np.nan)
-    bearing = _from_east(reader, rows.second * unit)
-    return Measured(range_m, bearing, elevation, range_sigma, bearing_sigma, elevation_sigma, has_elevation)
+    elevation = rows.z_m * unit
+    if not (np.nan_to_num(elevation) != 0).any():  # a radar of two dimensions leaves it zero
+        elevation = np.full(len(rows), np.nan)
+    values = {
+        "range": range_m, "bearing": _from_east(reader, rows.second * unit), "elevation": elevation,
+        "range_rate": stated["range_rate"],
+    }  # fmt: skip
+    sigmas = {
+        name: _sigma(reader, name, value, stated[f"{name}_sigma"] * (unit if _UNITS[name] == "degrees" else 1.0), suspicions)
+        for name, value in values.items()
+    }
+    _check_beam(reader, sigmas["bearing"])
+    known = [np.where(np.isfinite(sigmas[name]), value, np.nan) for name, value in values.items()]
+    return Measured(*known, *sigmas.values())
 
 
 def _from_east(reader: ChannelReader, bearing_rad: Float64s) -> Float64s:
@@ -116,36 +139,41 @@ def _is_distance(reader: ChannelReader, rows: Positions, suspicions: Suspicions)
     return found
 
 
-def _sigma(reader: ChannelReader, name: str, stated: Float64s, unit: float, suspicions: Suspicions) -> Float64s:
+def _sigma(reader: ChannelReader, name: str, value: Float64s, stated: Float64s, suspicions: Suspicions) -> Float64s:
     """Standard deviations [N] in metres or radians: the messages' where they are above zero, else that of the settings.
 
-    Rows without either cannot be weighed and are left out (NaN).
+    NaN without either: such a value cannot be weighed and is left out.
     """
-    setting = f"{name}_sigma_m" if name == "range" else f"{name}_sigma_deg"
-    given = getattr(reader.paths, setting)
-    default = np.nan if given is None else float(given if name == "range" else np.radians(given))
+    given = getattr(reader.paths, SETTINGS[name])
+    default = np.nan if given is None else float(np.radians(given) if _UNITS[name] == "degrees" else given)
     is_good = np.isfinite(stated) & (stated > 0)
-    num_bad = int((~is_good).sum())
-    if getattr(reader.paths, f"{name}_sigma") and num_bad and suspicions.looks_for("covariance"):
+    is_bad = ~is_good & np.isfinite(value)
+    if getattr(reader.paths, f"{name}_sigma") and is_bad.any() and suspicions.looks_for("covariance"):
         suspicions.add(
             "covariance", reader.channel.topic,
-            seen=f"{num_bad} of {len(stated)} standard deviations of its {name} are not above zero",
-            done="they are left out" if given is None else f"{given:g} {'m' if name == 'range' else 'degrees'} are taken",
-            setting=f"{setting} in its [[extract.{reader.role}]] (without {name}_sigma), or where",
+            seen=f"{int(is_bad.sum())} of {len(stated)} standard deviations of its {name} are not above zero",
+            done="they are left out" if given is None else f"{given:g} {_UNITS[name]} are taken",
+            setting=f"{SETTINGS[name]} in its [[extract.{reader.role}]] (without {name}_sigma), or where",
         )  # fmt: skip
-    found: Float64s = np.where(is_good, stated * unit, default)
-    if name == "bearing" and (found > _MOST_SIGMA_RAD).any():
+    return np.where(is_good, stated, default)
+
+
+def _check_beam(reader: ChannelReader, sigma_rad: Float64s) -> None:
+    """`ConfigError` where bearings are too vague for what is to be made of them."""
+    most_rad, what = (_MOST_SIGMA_RAD, "position") if reader.paths.range else (np.pi / 2, "direction")
+    if (sigma_rad > most_rad).any():
         raise ConfigError(
             f"extract.{reader.role}, topic {reader.channel.topic}: a standard deviation of the bearing of "
-            f"{np.degrees(np.nanmax(found)):.3g} degrees tells no position; correct bearing_sigma_deg or bearing_sigma"
+            f"{np.degrees(np.nanmax(sigma_rad)):.3g} degrees tells no {what}; correct bearing_sigma_deg or bearing_sigma"
         )
-    return found
 
 
 def assumed(reader: ChannelReader) -> str | None:
     """In words what accuracy is taken of a source that states none; None where it, or the user, does."""
     source, paths = reader.source, reader.paths
-    if not reader.is_polar or (reader.is_stated and source.range_sigma_m is not None and source.bearing_sigma_deg is not None):
+    if not (paths.range and paths.bearing) or (
+        reader.is_stated and source.range_sigma_m is not None and source.bearing_sigma_deg is not None
+    ):
         return None
     if paths.bearing_sigma or paths.range_sigma:
         return None

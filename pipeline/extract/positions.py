@@ -5,7 +5,7 @@ from array import array
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from typing import Any, Final, Self
+from typing import Any, ClassVar, Final, Self
 
 import numpy as np
 
@@ -28,6 +28,9 @@ class Positions:
     is_ned         whether x is north, y east and z down in the frame that the positions end in
     is_stated      whether the user configured the source (else it was suggested)
     """
+
+    PLACES: ClassVar[int] = 1
+    """Rows that stand for one thing that was seen."""
 
     time_ns: Int64s
     log_time_ns: Int64s
@@ -83,7 +86,7 @@ class Positions:
         return replace(self, **columns)._knowing(kept)
 
     @classmethod
-    def concatenate(cls, parts: Sequence["Positions"]) -> "Positions":
+    def concatenate(cls, parts: Sequence["Positions"]) -> Self:
         """All rows of `parts`, in order."""
         found = cls(*(np.concatenate([getattr(part, item.name) for part in parts]) for item in fields(cls)))
         return found._knowing({name: Names.joined([getattr(part, name) for part in parts]) for name in _NAMES})

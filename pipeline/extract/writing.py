@@ -4,7 +4,7 @@ Decoded messages become rows in the mission frame, sorted by time; whatever is l
 """
 
 import contextlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -26,16 +26,18 @@ from pipeline.extract.polar import assumed
 from pipeline.extract.positions import Positions
 from pipeline.extract.reading import read_positions
 from pipeline.extract.selection import select_readers, selected_channels, unused_channels
+from pipeline.extract.sightings import SIGHTINGS, Sightings, measurement_rows
 from pipeline.extract.summary import summarise, tell
 from pipeline.extract.tables import detection_table, track_table
 from pipeline.extract.transform_messages import LogTransforms
 from pipeline.logs.reader import MissionLog
 from pipeline.looks import write_looks
+from pipeline.measurements import write_measurements
 from pipeline.moments import moment_ns
 from pipeline.obstacle_file import OBSTACLES_NAME, write_obstacles
 from pipeline.progress import Progress
 from pipeline.suspicions import Suspicions, few
-from pipeline.tables import write_table
+from pipeline.tables import Frame, write_table
 from schemas.tables import POSES, TRUTH
 
 _MAX_DISAGREEING = 0.05
@@ -65,6 +67,7 @@ def write_tables(log: MissionLog, folder: Path, config: ExtractConfig, progress:
     if sensors:
         looks, footprints = collect_looks(sensors, rows["poses"], accurate, (log.start_ns, log.end_ns), suspicions)
         write_looks(folder, log_id, looks, footprints, frame)
+    told = _write_measurements(rows, readers, folder, log_id, frame)
     found = detection_table(log_id, detections, heights.datum is not None)
     write_table(found, folder / "detections.parquet", "detections", frame)
     if len(truth):
@@ -93,7 +96,7 @@ def write_tables(log: MissionLog, folder: Path, config: ExtractConfig, progress:
         refused = "; ".join(few(suspicions.lines()))
         raise ImplausibleInputError(f"{log.path}: refused by --strict, as something in it is suspected: {refused}")
     summary = summarise(log, readers, detections.positions, truth, poses, frame, counts, suspicions, len(obstacles))
-    told = {"accuracy": records, "unused": unused, "transforms": transforms.summary(counts)}
+    told |= {"accuracy": records, "unused": unused, "transforms": transforms.summary(counts)}
     return summary | told | ({"height": dict(heights.record)} if heights.record else {})
 
 
@@ -104,6 +107,21 @@ def _about(log: MissionLog) -> Iterator[None]:
         yield
     except InputError as error:
         raise type(error)(f"{log.path}: {error}") from error
+
+
+def _write_measurements(
+    rows: Mapping[str, Positions], readers: Sequence[ChannelReader], folder: Path, log_id: str, frame: Frame
+) -> dict[str, Any]:
+    """What sensors measured that is no position, where they did; what the summary says of it."""
+    sightings = rows.get(SIGHTINGS)
+    if not isinstance(sightings, Sightings):
+        return {}
+    datum = frame.vertical_datum
+    found = measurement_rows(sightings, {r.channel.topic for r in readers if datum is not None and r.vertical_datum == datum})
+    if not len(found):
+        return {}
+    write_measurements(folder, log_id, found, frame)
+    return {"measurements": found.counts()}
 
 
 def _cut_ns(log: MissionLog, config: ExtractConfig) -> tuple[int | None, int | None]:

@@ -12,6 +12,7 @@ from cadence.association.types import AssociationConfig
 from cadence.constraints.obstacles import Obstacles
 from cadence.errors import ImplausibleInputError
 from cadence.evidence.estimator import WithEvidence
+from cadence.evidence.measurements import Measurements
 from cadence.evidence.silence import Looks
 from cadence.height.bank import HeightBeside
 from cadence.types import Evidence
@@ -23,6 +24,7 @@ from pipeline.estimators.loaded import Fitted, Loaded
 from pipeline.estimators.presets import load_estimator
 from pipeline.infer.config import InferConfig
 from pipeline.infer.draws import Piece, draw_associations, draw_tracks, draw_windows
+from pipeline.infer.measuring import hear_measurements
 from pipeline.infer.silence import hear_silence
 from pipeline.looks import Footprint
 from pipeline.progress import Progress
@@ -33,12 +35,16 @@ from pipeline.windows import MissionWindows, build_windows
 
 @dataclass(frozen=True, eq=False)
 class Beside:
-    """What is known of a mission beside its detections: when it began, obstacles, what else speaks, where sensors looked."""
+    """What is known of a mission beside its detections.
+
+    When it began, obstacles, what else speaks, where sensors looked, and what they measured that is no position.
+    """
 
     start_ns: int
     obstacles: Obstacles
     evidence: tuple[Evidence, ...] = ()
     looks: tuple[tuple[Footprint, Looks], ...] = ()
+    measurements: Measurements | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,7 +122,10 @@ class Plan:
         knows, start_ns = loaded.knows_standing, beside.start_ns
         given = beside.looks, beside.obstacles, config.evidence, fitted.estimator
         silence = hear_silence(*given, seen.named, start_ns, knows)
-        num, evidence = config.num_hypotheses, (*beside.evidence, *silence.evidence) if config.evidence.is_used else ()
+        names = seen.named.agent_ids if seen.associated is None else seen.associated.windows.agent_ids
+        measured = hear_measurements(beside.measurements, config.evidence, names)
+        heard = (*beside.evidence, *silence.evidence, *measured.evidence)
+        num, evidence = config.num_hypotheses, heard if config.evidence.is_used else ()
         if seen.associated is None:
             weighed = WithEvidence(fitted.estimator, config.evidence, loaded.is_apart, loaded.num_past)
             located = seen.named.located(beside.start_ns, beside.obstacles, evidence)
@@ -125,9 +134,11 @@ class Plan:
             associated = seen.associated.located(beside.start_ns, beside.obstacles, evidence)
             draw = draw_tracks if loaded.is_apart else draw_associations
             draws = draw(fitted.estimator, associated, num, config.evidence)
-        about = {**fitted.about, **about, **silence.about}
+        about = {**fitted.about, **about, **silence.about, **measured.about}
         limit_mps = config.guidance.max_speed_mps
-        return Plan(config.checkpoint, seen, draws, about, suspicions, limit_mps, bool(evidence), silence.remarks)
+        return Plan(
+            config.checkpoint, seen, draws, about, suspicions, limit_mps, bool(evidence), (*silence.remarks, *measured.remarks)
+        )
 
     @property
     def windows(self) -> MissionWindows:

@@ -12,6 +12,7 @@ from pipeline.estimators.presets import find_weights, refuse_unread
 from pipeline.infer.config import InferConfig
 from pipeline.look_files import LOOK_FILES
 from pipeline.manifest import StageResult, run_stage
+from pipeline.measurement_files import MEASUREMENTS_NAME
 from pipeline.missions import CATALOGUE_NAME, no_mission
 from pipeline.obstacle_file import OBSTACLES_NAME
 from pipeline.progress import Progress
@@ -29,7 +30,7 @@ def infer(
     """
     weights = find_weights(config.checkpoint)
     inputs = [directory / "detections.parquet", directory / OBSTACLES_NAME]
-    inputs += [directory / name for name in LOOK_FILES if (directory / name).is_file()]
+    inputs += [directory / name for name in (*LOOK_FILES, MEASUREMENTS_NAME) if (directory / name).is_file()]
     if weights is not None:
         read_info(weights)  # names what is wrong with it more plainly than an input that is missing
         inputs += [weights, weights.with_suffix(".json")]

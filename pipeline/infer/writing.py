@@ -16,6 +16,7 @@ from pipeline.infer.draws import Drawn
 from pipeline.infer.plan import Beside, Plan
 from pipeline.infer.rows import hypothesis_rows, window_rows, with_association, with_effective
 from pipeline.looks import read_looks
+from pipeline.measurements import read_measurements
 from pipeline.obstacle_file import OBSTACLES_NAME, read_obstacles
 from pipeline.pasts import write_pasts
 from pipeline.progress import Progress
@@ -40,7 +41,8 @@ def write_tables(
             'the other, which takes a while; agent = "NAME" in [[extract.detections]] means one target, --start and --end '
             "take a part"
         )
-    beside = Beside(start_ns, read_obstacles(directory / OBSTACLES_NAME), looks=read_looks(directory, start_ns))
+    looks, measurements = read_looks(directory, start_ns), read_measurements(directory, start_ns)
+    beside = Beside(start_ns, read_obstacles(directory / OBSTACLES_NAME), looks=looks, measurements=measurements)
     with one_thread():
         plan = Plan.of(config, detections, beside, progress.part(0.0, _SHARE_APART))
         for line in plan.suspicions.lines():

@@ -20,10 +20,14 @@ PATH_KEYS = {"agent": "agent_path", "sensor": "sensor_path"}
 
 _CHECKED = (
     "agent_path", "sensor_path", "x", "y", "z", "latitude", "longitude", "altitude", "covariance", "sigma", "score", "time",
-    "frame_id", "range", "bearing", "elevation", "range_sigma", "bearing_sigma", "elevation_sigma",
+    "frame_id", "range", "bearing", "elevation", "range_rate", "range_sigma", "bearing_sigma", "elevation_sigma",
+    "range_rate_sigma",
 )  # fmt: skip
-_POSITIVE = ("sigma_m", "sigma_z_m", "range_sigma_m", "bearing_sigma_deg", "elevation_sigma_deg")
-_MEASURED = {"range": "range_sigma_m", "bearing": "bearing_sigma_deg", "elevation": "elevation_sigma_deg"}
+_POSITIVE = ("sigma_m", "sigma_z_m", "range_sigma_m", "bearing_sigma_deg", "elevation_sigma_deg", "range_rate_sigma_mps")
+_MEASURED = {
+    "range": "range_sigma_m", "bearing": "bearing_sigma_deg", "elevation": "elevation_sigma_deg",
+    "range_rate": "range_rate_sigma_mps",
+}  # fmt: skip
 """What a sensor may have measured, and the setting that says how exactly where messages do not."""
 
 
@@ -60,9 +64,11 @@ class SourceConfig:
     sensor, sensor_path  who saw it
     x, y, z     message paths of a position in metres
     latitude, longitude, altitude   message paths of a position in degrees (and metres), instead of x, y and z
-    range, bearing, elevation   message paths of what a sensor measured from where it was, instead of x and y
-    range_sigma, bearing_sigma, elevation_sigma   message paths of their standard deviations, in the same units
-    range_sigma_m, bearing_sigma_deg, elevation_sigma_deg   standard deviations where messages state none
+    range, bearing, elevation, range_rate   message paths of what a sensor measured from where it was, instead of x and y; range
+                and bearing together become positions, one alone and range_rate (positive: away from it) speak about tracks
+    range_sigma, bearing_sigma, elevation_sigma, range_rate_sigma   message paths of their standard deviations, in the same
+                units
+    range_sigma_m, bearing_sigma_deg, elevation_sigma_deg, range_rate_sigma_mps   standard deviations where messages state none
     bearing_unit of bearing, elevation and their standard deviations: "rad" (default) or "deg"
     bearing_convention   "math" (default): from the x axis of the sensor's frame (ahead, or east) towards y, as ROS has it;
                 "compass": clockwise from north
@@ -116,12 +122,15 @@ class SourceConfig:
     range: str | None = None
     bearing: str | None = None
     elevation: str | None = None
+    range_rate: str | None = None
     range_sigma: str | None = None
     bearing_sigma: str | None = None
     elevation_sigma: str | None = None
+    range_rate_sigma: str | None = None
     range_sigma_m: float | None = None
     bearing_sigma_deg: float | None = None
     elevation_sigma_deg: float | None = None
+    range_rate_sigma_mps: float | None = None
     bearing_unit: AngleUnit | None = None
     bearing_convention: BearingConvention | None = None
     observer: str | None = None
@@ -157,8 +166,6 @@ class SourceConfig:
         kinds = [self.x is not None, self.latitude is not None, self.range is not None or self.bearing is not None]
         if sum(kinds) > 1:
             raise ValueError(f"topic {self.topic!r}: give only one of x and y, latitude and longitude, range and bearing")
-        if (self.range is None) != (self.bearing is None):
-            raise ValueError(f"topic {self.topic!r}: range and bearing go together; one alone is no position, and is not used")
         for first, second in (("observer_x_m", "observer_y_m"), ("observer_latitude", "observer_longitude")):
             if (getattr(self, first) is None) != (getattr(self, second) is None):
                 raise ValueError(f"topic {self.topic!r}: {first} and {second} go together")

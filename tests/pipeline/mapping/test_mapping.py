@@ -173,7 +173,6 @@ def test_patterns(pattern: str, topic: str, expected: dict[str, str] | None) -> 
         ({"topic": "/a", "x": "p.x"}, "go together"),
         ({"topic": "/a", "x": "p.x", "y": "p.y", "latitude": "lat", "longitude": "lon"}, "only one of x and y, latitude"),
         ({"topic": "/a", "x": "p.x", "y": "p.y", "range": "r", "bearing": "b"}, "only one of x and y, latitude"),
-        ({"topic": "/a", "range": "r"}, "range and bearing go together"),
         ({"topic": "/a", "range": "r", "bearing": "b", "bearing_sigma_deg": 0.0}, "bearing_sigma_deg must be positive"),
         ({"topic": "/a", "range": "r", "bearing": "b", "observer_x_m": 1.0}, "observer_x_m and observer_y_m go together"),
         ({"topic": "/a", "range": "r", "bearing": "b", "observer_heading_deg": 1.0}, "a frame's heading is in transforms"),
