@@ -50,7 +50,8 @@ class ChannelReader:
             raise ConfigError(f"extract.{role}, topic {channel.topic}: ranges and bearings are detections; name other topics")
         self.paths, self.is_polar, self.is_geodetic = paths, paths.is_polar, bool(paths.latitude)
         self.names = {"agent": named.get("agent", source.agent), "sensor": named.get("sensor", source.sensor)}
-        names = _POLAR if self.is_polar else _GEODETIC if self.is_geodetic else _METRIC
+        self.is_camera = bool(paths.pixel_x)
+        names = _PIXELS if self.is_camera else _POLAR if self.is_polar else _GEODETIC if self.is_geodetic else _METRIC
         alternatives = [getattr(paths, name) for name in names]
         self.alternatives, self.json_text = paths.alternatives, paths.json_text
         if self.alternatives == "first":
@@ -259,10 +260,13 @@ def _frame_name(value: Any) -> str | None:
 _COLUMNS = ("first", "second", "z")
 _METRIC = ("x", "y", "z")
 _GEODETIC = ("latitude", "longitude", "altitude")
+_PIXELS = ("range", "pixel_x", "pixel_y")
 _POLAR = ("range", "bearing", "elevation")
-MEASURED = ("range_rate", "range_sigma", "bearing_sigma", "elevation_sigma", "range_rate_sigma")
-"""What sources of ranges and bearings may state beside these."""
-_NEEDED = ("x", "y", "latitude", "longitude", "range", "bearing")
+MEASURED = (
+    "range_rate", "range_sigma", "bearing_sigma", "elevation_sigma", "range_rate_sigma", "box_width", "box_height",
+)  # fmt: skip
+"""What sources of ranges and bearings, or of pixels, may state beside these."""
+_NEEDED = ("x", "y", "latitude", "longitude", "range", "bearing", "pixel_x", "pixel_y")
 _OTHERS = ("covariance", "covariance_type", "sigma", "time", "frame_id", "agent", "sensor", "score")
 _CONVERSIONS: Mapping[str, Callable[[Any], Any]] = {"time": stamp_ns, "frame_id": _frame_name}
 

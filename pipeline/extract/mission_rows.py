@@ -10,6 +10,7 @@ import numpy as np
 
 from cadence.errors import InputError, NothingDetectedError
 from pipeline.counted import counted
+from pipeline.extract.cameras import read_cameras
 from pipeline.extract.channel_reader import ChannelReader
 from pipeline.extract.config import ExtractConfig
 from pipeline.extract.fill_ins import without_fill_ins
@@ -53,7 +54,8 @@ def rows_in_frame(
 ) -> tuple[dict[str, Positions], Frame]:  # fmt: skip
     """The rows of every role, placed in the mission frame and thinned, and that frame."""
     parts: Parts = {role: [(reader, reader.finish()) for reader in readers if reader.role == role] for role in ROLES[1:]}
-    detections, sightings = read_parts([reader for reader in readers if reader.role == "detections"], suspicions)
+    detecting = [reader for reader in readers if reader.role == "detections"]
+    detections, sightings = read_parts(detecting, read_cameras(log, detecting), counts, suspicions)
     parts = {"detections": detections, **parts} | ({SIGHTINGS: sightings} if sightings else {})
     parts = without_set_back(parts, suspicions)
     if counts["steps_back"] and config.start is None and config.end is None:

@@ -12,6 +12,7 @@ import numpy as np
 from cadence.arrays import Bools, Float64s
 from cadence.errors import ConfigError
 from cadence.measurement.polar import cartesian, is_nearly_normal
+from pipeline.extract.cameras import Camera
 from pipeline.extract.channel_reader import ChannelReader
 from pipeline.extract.positions import Positions
 from pipeline.suspicions import Suspicions
@@ -20,6 +21,8 @@ _LITTLE_MORE: Final = 1.01
 """Angles that are counted on over a full turn by a rounding are no degrees."""
 _MOST_SIGMA_RAD: Final = 0.35
 """Beyond 20 degrees a beam tells a side of the sensor and no position."""
+_OF_SIZE: Final = 0.1
+"""Where in its box a target is: a standard deviation of the box's centre in widths and heights of it."""
 _UNITS: Final = {"range": "m", "bearing": "degrees", "elevation": "degrees", "range_rate": "m/s"}
 SETTINGS: Final = {
     "range": "range_sigma_m", "bearing": "bearing_sigma_deg", "elevation": "elevation_sigma_deg",
@@ -93,6 +96,18 @@ def measured(reader: ChannelReader, rows: Positions, suspicions: Suspicions) -> 
     _check_beam(reader, sigmas["bearing"])
     known = [np.where(np.isfinite(sigmas[name]), value, np.nan) for name, value in values.items()]
     return Measured(*known, *sigmas.values())
+
+
+def seen(reader: ChannelReader, rows: Positions, camera: Camera) -> Measured:
+    """The directions in which a camera saw what is at pixels [N], which are second and z: left of and above its axis."""
+    stated, sigma = reader.measured(), reader.source.pixel_sigma
+    right, down = camera.slopes(np.column_stack([rows.second, rows.z_m])).T
+    sides = (stated["box_width"], stated["box_height"])
+    pixels = [np.maximum(1.0, _OF_SIZE * np.nan_to_num(side)) if sigma is None else np.full(len(rows), sigma) for side in sides]
+    elevation = np.arctan2(-down, np.hypot(1.0, right))
+    across, upright = (exact / focal for exact, focal in zip(pixels, camera.focal, strict=True))
+    nothing = np.full(len(rows), np.nan)
+    return Measured(nothing, -np.arctan(right), elevation, nothing, nothing, across, upright, nothing)
 
 
 def _from_east(reader: ChannelReader, bearing_rad: Float64s) -> Float64s:

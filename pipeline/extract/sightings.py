@@ -6,15 +6,17 @@ which transforms and observers move like any other positions.
 """
 
 import copy
-from collections.abc import Collection, Sequence
+from collections import Counter
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import ClassVar, Final
 
 import numpy as np
 
 from cadence.arrays import Bools, Float64s, Int64s
+from pipeline.extract.cameras import Camera
 from pipeline.extract.channel_reader import ChannelReader
-from pipeline.extract.polar import Measured, as_positions, measured
+from pipeline.extract.polar import Measured, as_positions, measured, seen
 from pipeline.extract.positions import Positions
 from pipeline.measurements import MeasurementRows
 from pipeline.suspicions import Suspicions
@@ -46,14 +48,20 @@ class Sightings(Positions):
     is_sensor: Bools
 
 
-def read_parts(readers: Sequence[ChannelReader], suspicions: Suspicions) -> tuple[list[Part], list[Part]]:
+def read_parts(
+    readers: Sequence[ChannelReader], cameras: Mapping[int, Camera], counts: Counter[str], suspicions: Suspicions
+) -> tuple[list[Part], list[Part]]:
     """The detections of every reader as positions, and what else they measured.
 
     Ranges with bearings of too wide a beam are sightings where some detection gives a position of the same agent, from which
     its tracks can be drawn; else they are positions all the same, as exact as they are.
     """
     raw = [(reader, reader.finish()) for reader in readers]
-    found = {id(reader): measured(reader, rows, suspicions) for reader, rows in raw if reader.is_polar and len(rows)}
+    found = {
+        id(reader): seen(reader, rows, cameras[reader.channel.id]) if reader.is_camera else measured(reader, rows, suspicions)
+        for reader, rows in raw
+        if reader.is_polar and len(rows)
+    }
     known: set[str | None] = set()
     for reader, rows in raw:
         each = found.get(id(reader))
@@ -69,9 +77,12 @@ def read_parts(readers: Sequence[ChannelReader], suspicions: Suspicions) -> tupl
         is_place = bool(reader.paths.range and reader.paths.bearing)
         if is_place:
             positions += [(reader, as_positions(rows, each)[~is_apart])]
-        seen = _sightings(rows, each, is_apart | (not is_place))
-        if len(seen):  # of a reader of its own: rows are known by theirs
-            sightings += [(copy.copy(reader), seen)]
+        others = _sightings(rows, each, is_apart | (not is_place))
+        counts["dropped_nonfinite"] += 0 if is_place else len(rows) - len(others)
+        if reader.is_camera:
+            others = _in_optical_axes(others, cameras[reader.channel.id].frame_id)
+        if len(others):  # of a reader of its own: rows are known by theirs
+            sightings += [(copy.copy(reader), others)]
     return positions, sightings
 
 
@@ -90,6 +101,13 @@ def _sightings(rows: Positions, found: Measured, is_apart: Bools) -> Sightings:
     )  # fmt: skip
     columns = {item.name: getattr(along, item.name) for item in fields(Positions)}
     return Sightings(**columns, numbers=numbers, key=np.arange(len(rows)), is_sensor=np.zeros(len(rows), np.bool_))[kept]
+
+
+def _in_optical_axes(rows: Sightings, frame_id: str) -> Sightings:
+    """What a camera saw ahead, left of it and above, in the axes of its optical frame: right, down and ahead (REP 103)."""
+    if frame_id:
+        rows = rows.changed(frame_id=np.full(len(rows), frame_id, dtype=object))
+    return rows.changed(first=-rows.second, second=-rows.z_m, z_m=rows.first)
 
 
 def in_pairs(rows: Positions) -> Sightings:
@@ -128,6 +146,10 @@ def measurement_rows(placed: Sightings, height_topics: Collection[str]) -> Measu
         "elevation_rad": np.where(np.isfinite(elevation), raised, np.nan), "range_rate_mps": range_rate,
     }  # fmt: skip
     names = ("range_sigma_m", "bearing_sigma_rad", "elevation_sigma_rad", "range_rate_sigma_mps")
+    # across the line of sight it is as exact as before, wherever that points now; straight down it has no bearing
+    with np.errstate(divide="ignore", invalid="ignore"):
+        turned = np.minimum(sigmas[1] * np.cos(elevation) / np.abs(np.cos(raised)), np.pi)
+    sigmas[1] = np.where(np.isfinite(turned), turned, sigmas[1])
     exact = {
         name: np.where(np.isfinite(value), sigma, np.nan)
         for name, value, sigma in zip(names, values.values(), sigmas, strict=True)

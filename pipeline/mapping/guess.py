@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, fields, replace
 from typing import Final, Literal
 
 from pipeline.mapping.field_paths import coordinate_paths
+from pipeline.mapping.message_type import MessageType
 from pipeline.mapping.message_types import MESSAGE_TYPES, POLAR, SETPOINTS, normalise_schema, type_of_schema
 from pipeline.mapping.sources import ChannelLike, SourceConfig
 from pipeline.mapping.topic_names import DETECTION_WORDS, POSE_WORDS, TRUTH_WORDS, pattern_of, words_of
@@ -161,6 +162,8 @@ def _why_unused(channel: ChannelLike, role: Role | None) -> str | None:
         return "it may be where a vehicle is told to go"
     if normalise_schema(channel.schema_name) in POLAR:
         return "its ranges and bearings are used only where a source states their paths"
+    if MESSAGE_TYPES.get(type_of_schema(channel.schema_name) or "", MessageType(())).pixel_x:
+        return "boxes of a camera are directions; a source that says whom they show uses them"
     if type_of_schema(channel.schema_name) is not None:
         return "what is drawn may be anything"
     return "its type is not known"

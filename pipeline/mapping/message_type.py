@@ -12,7 +12,7 @@ FRAME_PATHS: Paths = ("header.frame_id", "frame_id")
 PATHS: Final = (
     "x", "y", "z", "latitude", "longitude", "altitude", "covariance", "covariance_type", "sigma", "time", "frame_id", "agent",
     "sensor", "score", "range", "bearing", "elevation", "range_rate", "range_sigma", "bearing_sigma", "elevation_sigma",
-    "range_rate_sigma",
+    "range_rate_sigma", "pixel_x", "pixel_y", "box_width", "box_height",
 )  # fmt: skip
 """The fields of a message type that are message paths."""
 
@@ -36,6 +36,7 @@ class MessageType:
     sigma            standard deviation of x and y in metres, where there is no covariance
     range, bearing, elevation, range_rate  what a sensor measured from where it was, and their standard deviations (..._sigma)
     range_sigma_m, bearing_sigma_deg, elevation_sigma_deg, range_rate_sigma_mps  where messages state none
+    pixel_x, pixel_y, box_width, box_height  what a camera saw: right and down from the corner of its image, and how large
     bearing_unit     of bearing, elevation and their standard deviations
     bearing_convention  what a bearing counts from
     where            conditions (see `conditions`); those hold whose fields a message has
@@ -68,6 +69,10 @@ class MessageType:
     bearing_sigma: Paths = ()
     elevation_sigma: Paths = ()
     range_rate_sigma: Paths = ()
+    pixel_x: Paths = ()
+    pixel_y: Paths = ()
+    box_width: Paths = ()
+    box_height: Paths = ()
     range_sigma_m: float | None = None
     bearing_sigma_deg: float | None = None
     elevation_sigma_deg: float | None = None
@@ -92,12 +97,12 @@ class MessageType:
     @property
     def is_array(self) -> bool:
         """Whether a message may hold several positions."""
-        return any("[:]" in path for path in (*self.x, *self.latitude, *self.range, *self.bearing))
+        return any("[:]" in path for path in (*self.x, *self.latitude, *self.range, *self.bearing, *self.pixel_x))
 
     @property
     def is_polar(self) -> bool:
-        """Whether it states ranges or bearings and no positions."""
-        return bool(self.range or self.bearing)
+        """Whether it states ranges, bearings or pixels and no positions."""
+        return bool(self.range or self.bearing or self.pixel_x)
 
 
 def metric(schema: str, *points: str) -> MessageType:

@@ -6,13 +6,14 @@ A type is found by the schema's name, whatever the encoding: `geometry_msgs/msg/
 
 from typing import Final
 
+from pipeline.mapping.camera_types import CAMERAS
 from pipeline.mapping.fix_types import FIXES
 from pipeline.mapping.message_type import MessageType
 from pipeline.mapping.object_types import OBJECTS
 from pipeline.mapping.pose_types import POSES
 from pipeline.mapping.radar_types import RADARS
 
-MESSAGE_TYPES: Final[dict[str, MessageType]] = {**POSES, **FIXES, **OBJECTS, **RADARS}
+MESSAGE_TYPES: Final[dict[str, MessageType]] = {**POSES, **FIXES, **OBJECTS, **RADARS, **CAMERAS}
 
 SETPOINTS: Final = {
     "mavros_msgs.GlobalPositionTarget", "mavros_msgs.PositionTarget", "px4_msgs.PositionSetpoint",

@@ -21,14 +21,18 @@ PATH_KEYS = {"agent": "agent_path", "sensor": "sensor_path"}
 _CHECKED = (
     "agent_path", "sensor_path", "x", "y", "z", "latitude", "longitude", "altitude", "covariance", "sigma", "score", "time",
     "frame_id", "range", "bearing", "elevation", "range_rate", "range_sigma", "bearing_sigma", "elevation_sigma",
-    "range_rate_sigma",
+    "range_rate_sigma", "pixel_x", "pixel_y", "box_width", "box_height",
 )  # fmt: skip
-_POSITIVE = ("sigma_m", "sigma_z_m", "range_sigma_m", "bearing_sigma_deg", "elevation_sigma_deg", "range_rate_sigma_mps")
+_POSITIVE = (
+    "sigma_m", "sigma_z_m", "range_sigma_m", "bearing_sigma_deg", "elevation_sigma_deg", "range_rate_sigma_mps", "pixel_sigma",
+)  # fmt: skip
 _MEASURED = {
     "range": "range_sigma_m", "bearing": "bearing_sigma_deg", "elevation": "elevation_sigma_deg",
     "range_rate": "range_rate_sigma_mps",
 }  # fmt: skip
 """What a sensor may have measured, and the setting that says how exactly where messages do not."""
+_OF_BEARINGS = ("bearing_unit", "bearing_convention", "observer", "observer_x_m", "observer_latitude")
+_OF_PIXELS = ("box_width", "box_height", "pixel_sigma", "camera_info")
 
 
 HeightUnit = Literal["m", "ft", "FL"]
@@ -72,6 +76,10 @@ class SourceConfig:
     bearing_unit of bearing, elevation and their standard deviations: "rad" (default) or "deg"
     bearing_convention   "math" (default): from the x axis of the sensor's frame (ahead, or east) towards y, as ROS has it;
                 "compass": clockwise from north
+    pixel_x, pixel_y   message paths of what a camera saw, right and down from the corner of its image, instead of x and y
+    box_width, box_height   message paths of its size in pixels, of which a tenth is the standard deviation (one at least)
+    pixel_sigma   standard deviation in pixels instead
+    camera_info topic of the camera's sensor_msgs/CameraInfo; default: the one whose name is nearest
     observer    the sensor of [[extract.poses]] from whose places it was measured; default: the origin of the frame that
                 frame_id names, at the stamp, by the log's transforms
     observer_x_m, observer_y_m   where it was measured from, in the mission frame, where that stands
@@ -133,6 +141,12 @@ class SourceConfig:
     range_rate_sigma_mps: float | None = None
     bearing_unit: AngleUnit | None = None
     bearing_convention: BearingConvention | None = None
+    pixel_x: str | None = None
+    pixel_y: str | None = None
+    box_width: str | None = None
+    box_height: str | None = None
+    pixel_sigma: float | None = None
+    camera_info: str | None = None
     observer: str | None = None
     observer_x_m: float | None = None
     observer_y_m: float | None = None
@@ -163,9 +177,13 @@ class SourceConfig:
     def _check_position(self) -> None:
         if (self.x is None) != (self.y is None) or (self.latitude is None) != (self.longitude is None):
             raise ValueError(f"topic {self.topic!r}: x and y (or latitude and longitude) go together")
+        if (self.pixel_x is None) != (self.pixel_y is None):
+            raise ValueError(f"topic {self.topic!r}: pixel_x and pixel_y go together")
         kinds = [self.x is not None, self.latitude is not None, self.range is not None or self.bearing is not None]
-        if sum(kinds) > 1:
-            raise ValueError(f"topic {self.topic!r}: give only one of x and y, latitude and longitude, range and bearing")
+        if sum((*kinds, self.pixel_x is not None)) > 1:
+            raise ValueError(
+                f"topic {self.topic!r}: give only one of x and y, latitude and longitude, range and bearing, or pixels"
+            )
         for first, second in (("observer_x_m", "observer_y_m"), ("observer_latitude", "observer_longitude")):
             if (getattr(self, first) is None) != (getattr(self, second) is None):
                 raise ValueError(f"topic {self.topic!r}: {first} and {second} go together")
@@ -206,7 +224,7 @@ class SourceConfig:
 
 def resolve_paths(source: SourceConfig, schema_name: str) -> MessageType:
     """The message paths for a schema: what the source states over its type; `ConfigError` where there is no position."""
-    is_custom = any(path is not None for path in (source.x, source.latitude, source.range, source.bearing))
+    is_custom = any(path is not None for path in (source.x, source.latitude, source.range, source.bearing, source.pixel_x))
     name = source.message_type if source.message_type is not None or is_custom else type_of_schema(schema_name)
     if name is None and not is_custom:
         raise ConfigError(
@@ -237,14 +255,23 @@ def _check_measured(source: SourceConfig, found: MessageType) -> None:
     """`ConfigError` where ranges and bearings lack what they need, or settings are of those and the source has none."""
     where = f"topic {source.topic}"
     if not found.is_polar:
-        names = [*_MEASURED, *_MEASURED.values(), "bearing_unit", "bearing_convention", "observer", "observer_x_m"]
-        unread = [name for name in (*names, "observer_latitude") if getattr(source, name) is not None]
+        names = [*_MEASURED, *_MEASURED.values(), *_OF_BEARINGS, *_OF_PIXELS]
+        unread = [name for name in names if getattr(source, name) is not None]
         if unread:
             raise ConfigError(f"{where}: {unread[0]} is of ranges and bearings, and it has positions; leave it out")
         return
     unread = [name for name in ("sigma", "sigma_m", "covariance", "unit") if getattr(source, name) is not None]
     if unread:
         raise ConfigError(f"{where}: {unread[0]} is of positions; state range_sigma_m and bearing_sigma_deg instead")
+    unread = [name for name in (_OF_BEARINGS if found.pixel_x else _OF_PIXELS) if getattr(source, name) is not None]
+    if unread:
+        raise ConfigError(
+            f"{where}: {unread[0]} is of {'bearings' if found.pixel_x else 'pixels'}, and it has others; leave it out"
+        )
+    if found.pixel_x and not found.box_width and source.pixel_sigma is None:
+        raise ConfigError(
+            f"{where}: nothing says how exact its pixels are; give pixel_sigma, or the paths box_width and box_height"
+        )
     for name, setting in _MEASURED.items():
         has_sigma = getattr(found, f"{name}_sigma") or getattr(found, setting) is not None
         if getattr(source, name) is not None and not has_sigma:
