@@ -14,7 +14,7 @@ import pyarrow as pa
 
 from cadence.arrays import Float64s, Int64s, Objects
 from cadence.evidence.measurements import KINDS, Measurements
-from pipeline.measurement_files import MEASUREMENTS_NAME
+from pipeline.measurement_words import MEASUREMENTS_NAME
 from pipeline.tables import Frame, read_table, write_table
 from schemas.tables import MEASUREMENTS
 

@@ -49,7 +49,7 @@ FLOORS = {
             "obstacle_file",
             "score_words",
             "look_files",
-            "measurement_files",
+            "measurement_words",
             "stream_words",
             "suspicions",
             "threads",

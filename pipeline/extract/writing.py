@@ -32,6 +32,7 @@ from pipeline.extract.tables import detection_table, track_table
 from pipeline.extract.transform_messages import LogTransforms
 from pipeline.logs.reader import MissionLog
 from pipeline.looks import write_looks
+from pipeline.measurement_words import measurement_words
 from pipeline.measurements import write_measurements
 from pipeline.moments import moment_ns
 from pipeline.obstacle_file import OBSTACLES_NAME, write_obstacles
@@ -87,6 +88,8 @@ def write_tables(log: MissionLog, folder: Path, config: ExtractConfig, progress:
         progress.note(f"extract: {line}")
     for channel, why in unused.items():
         progress.note(f"extract: {channel} may hold detections and is not used: {why}")
+    if words := measurement_words(told.get("measurements", {})):
+        progress.note(f"extract: {words}")
     transforms.tell()
     if frame.frame_id.lower().endswith("ned"):
         progress.note(

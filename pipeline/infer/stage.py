@@ -12,7 +12,7 @@ from pipeline.estimators.presets import find_weights, refuse_unread
 from pipeline.infer.config import InferConfig
 from pipeline.look_files import LOOK_FILES
 from pipeline.manifest import StageResult, run_stage
-from pipeline.measurement_files import MEASUREMENTS_NAME
+from pipeline.measurement_words import MEASUREMENTS_NAME
 from pipeline.missions import CATALOGUE_NAME, no_mission
 from pipeline.obstacle_file import OBSTACLES_NAME
 from pipeline.progress import Progress

@@ -15,6 +15,7 @@ from pipeline.inspect.log_times import time_remarks
 from pipeline.logs.container import container_remarks
 from pipeline.logs.health import utc
 from pipeline.logs.reader import MissionLog, open_parts
+from pipeline.measurement_words import measurement_words
 from pipeline.missions import find_missions
 from pipeline.progress import Progress
 from pipeline.stores.urls import is_url
@@ -196,6 +197,8 @@ def _use_lines(diagnosis: Diagnosis) -> list[str]:
     for role, name, whose in (("truth", "num_truth", "the truth"), ("poses", "num_poses", "sensors")):
         if use[name]:
             counts.append(f"{counted(use[name], 'position')} of {whose}{_topics(use, role)}")
+    if words := measurement_words(use.get("measurements", {})):
+        counts.append(words)
     counts += [f"left out: {told(use[name], words)}" for name, words in _LEFT_OUT.items() if use[name]]
     return counts + [f"not used, though it may hold detections: {channel}: {why}" for channel, why in use["unused"].items()]
 

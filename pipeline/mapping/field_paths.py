@@ -10,6 +10,21 @@ from rosbags.typesys import get_types_from_msg
 _PAIRS: Final = (  # of one structure, the likeliest first
     ("latitude", "longitude"), ("latitude_deg", "longitude_deg"), ("lat", "lon"), ("lat", "lng"), ("lat", "long"), ("x", "y"),
 )  # fmt: skip
+_MEASURED: Final = {
+    "range": ("range", "range_m", "distance"),
+    "bearing": (
+        "bearing",
+        "azimuth",
+        "azimuth_angle",
+        "doa",
+        "aoa",
+        "bearing_deg",
+        "azimuth_deg",
+        "bearing_rad",
+        "azimuth_rad",
+    ),
+    "elevation": ("elevation", "elevation_angle", "elevation_deg", "elevation_rad"),
+}
 _MAX_DEPTH: Final = 6
 
 Fields = Mapping[str, Any]
@@ -21,17 +36,33 @@ def coordinate_paths(schema_name: str, schema_data: bytes) -> tuple[str, str] | 
 
     Read are definitions of ROS 1 and ROS 2, and JSON schemas.
     """
-    try:
-        text = schema_data.decode()
-        fields = _of_json(json.loads(text)) if text.lstrip().startswith("{") else _of_ros(schema_name, text)
-    except Exception:  # foreign parsers raise what they like, and a suggestion is not worth an error
-        return None
-    found = list(_structures(fields, "", 0))
+    found = _known(schema_name, schema_data)
     for first, second in _PAIRS:
         for prefix, names in found:
             if first in names and second in names:
                 return f"{prefix}{first}", f"{prefix}{second}"
     return None
+
+
+def measured_paths(schema_name: str, schema_data: bytes) -> Mapping[str, str]:
+    """Paths of a bearing and, beside it, a range and an elevation, by these names; empty where a schema tells of no bearing."""
+    found = _known(schema_name, schema_data)
+    for bearing in _MEASURED["bearing"]:
+        for prefix, names in found:
+            if bearing in names:
+                beside = {kind: next((name for name in known if name in names), None) for kind, known in _MEASURED.items()}
+                return {kind: f"{prefix}{name}" for kind, name in beside.items() if name is not None}
+    return {}
+
+
+def _known(schema_name: str, schema_data: bytes) -> list[tuple[str, set[str]]]:
+    """Path and names of the plain fields of every structure of a schema; empty where it cannot be read."""
+    try:
+        text = schema_data.decode()
+        fields = _of_json(json.loads(text)) if text.lstrip().startswith("{") else _of_ros(schema_name, text)
+        return list(_structures(fields, "", 0))
+    except Exception:  # foreign parsers raise what they like, and a suggestion is not worth an error
+        return []
 
 
 def _structures(fields: Fields, prefix: str, depth: int) -> Iterator[tuple[str, set[str]]]:

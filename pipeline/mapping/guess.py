@@ -10,8 +10,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Final, Literal
 
-from pipeline.mapping.field_paths import coordinate_paths
-from pipeline.mapping.message_type import MessageType
+from pipeline.mapping.field_paths import coordinate_paths, measured_paths
 from pipeline.mapping.message_types import MESSAGE_TYPES, POLAR, SETPOINTS, normalise_schema, type_of_schema
 from pipeline.mapping.sources import ChannelLike, SourceConfig
 from pipeline.mapping.topic_names import DETECTION_WORDS, POSE_WORDS, TRUTH_WORDS, pattern_of, words_of
@@ -41,8 +40,8 @@ _NEVER_POSITIONS = {"std_msgs", "sensor_msgs", "rcl_interfaces", "diagnostic_msg
 class SuggestedMapping:
     """What the channels look like. `roles` maps topics to roles; the sources hold only channels of known types.
 
-    `unread` are detections of types that are not known, with paths that may fit; `unused` all topics that may hold
-    detections and are in no source, and why they are not.
+    `unread` are detections of types that are not known, with paths that may fit; `cameras` see what only the user can name;
+    `unused` all topics that may hold detections and are in no source, and why they are not.
     """
 
     roles: Mapping[str, Role]
@@ -51,17 +50,19 @@ class SuggestedMapping:
     poses: tuple[SourceConfig, ...] = ()
     positions: tuple[SourceConfig, ...] = ()
     unread: tuple[SourceConfig, ...] = ()
+    cameras: tuple[SourceConfig, ...] = ()
     unused: Mapping[str, str] = field(default_factory=dict)
 
     def to_toml(self) -> str:
         """The `[extract]` lines of this mapping, ready to paste; what needs a decision is a comment."""
         blocks = [_entry(role, source) for role in ("detections", "truth", "poses") for source in getattr(self, role)]
-        for source in self.positions:
-            comment = "a position, but the name does not tell of what: make it detections, truth or poses"
-            blocks.append("# " + f"{comment}\n{_entry('detections', source)}".replace("\n", "\n# "))
-        for source in self.unread:
-            entry = _entry("detections", source)
-            blocks.append("# " + f"its type is not known: give the paths of its fields\n{entry}".replace("\n", "\n# "))
+        comments = {
+            "a position, but the name does not tell of what: make it detections, truth or poses": self.positions,
+            "its type is not known: give the paths of its fields": self.unread,
+            "boxes of a camera are directions: say whom they show, by agent or agent_path": self.cameras,
+        }
+        for comment, sources in comments.items():
+            blocks += ["# " + f"{comment}\n{_entry('detections', each)}".replace("\n", "\n# ") for each in sources]
         if blocks and not self.detections:
             blocks.append("# to make sparse detections out of the dense channel:\n# [extract.thinning]\n# enabled = true")
         return "\n\n".join(blocks) + ("\n" if blocks else "")
@@ -89,6 +90,7 @@ def suggest_mapping(channels: Sequence[ChannelLike]) -> SuggestedMapping:
         poses=_sources(readable("poses"), "poses"),
         positions=_sources(readable("positions"), "positions"),
         unread=tuple(_unread_source(c) for c in channels if roles.get(c.topic) == "detections" and not usable_type(c)),
+        cameras=tuple(SourceConfig(c.topic, message_type=known, agent="NAME") for c in channels if (known := _boxes_of(c))),
         unused=unused | {channel.topic: _SPARE for channel in spare},
     )
 
@@ -162,7 +164,7 @@ def _why_unused(channel: ChannelLike, role: Role | None) -> str | None:
         return "it may be where a vehicle is told to go"
     if normalise_schema(channel.schema_name) in POLAR:
         return "its ranges and bearings are used only where a source states their paths"
-    if MESSAGE_TYPES.get(type_of_schema(channel.schema_name) or "", MessageType(())).pixel_x:
+    if _boxes_of(channel):
         return "boxes of a camera are directions; a source that says whom they show uses them"
     if type_of_schema(channel.schema_name) is not None:
         return "what is drawn may be anything"
@@ -171,11 +173,25 @@ def _why_unused(channel: ChannelLike, role: Role | None) -> str | None:
 
 def _unread_source(channel: ChannelLike) -> SourceConfig:
     """An entry for a channel of a type that is not known, with paths out of its schema where it has any that fit."""
-    first, second = coordinate_paths(channel.schema_name, channel.schema_data) or ("position.x", "position.y")
+    found = coordinate_paths(channel.schema_name, channel.schema_data)
+    measured = {} if found else measured_paths(channel.schema_name, channel.schema_data)
+    if measured:
+        return _unread_bearings(channel.topic, measured)
+    first, second = found or ("position.x", "position.y")
     if first.rpartition(".")[2].startswith("lat"):
         return SourceConfig(channel.topic, latitude=first, longitude=second)
     is_ned = normalise_schema(channel.schema_name).startswith("px4_msgs.")
     return SourceConfig(channel.topic, x=first, y=second, frame_convention="ned" if is_ned else None)
+
+
+def _unread_bearings(topic: str, paths: Mapping[str, str]) -> SourceConfig:
+    """An entry with paths of bearings, and accuracies that whoever knows the sensor will correct."""
+    has_range, has_elevation = "range" in paths, "elevation" in paths
+    return SourceConfig(
+        topic, range=paths.get("range"), bearing=paths["bearing"], elevation=paths.get("elevation"),
+        bearing_unit="deg" if paths["bearing"].endswith("_deg") else None, range_sigma_m=10.0 if has_range else None,
+        bearing_sigma_deg=1.0, elevation_sigma_deg=1.0 if has_elevation else None,
+    )  # fmt: skip
 
 
 def _sources(channels: Sequence[ChannelLike], role: Role) -> tuple[SourceConfig, ...]:
@@ -221,6 +237,12 @@ def _holds_several(channel: ChannelLike) -> bool:
 def _names_agents(channel: ChannelLike) -> bool:
     known = usable_type(channel)
     return known is not None and MESSAGE_TYPES[known].names_agents
+
+
+def _boxes_of(channel: ChannelLike) -> str | None:
+    """The name of the known type of a camera's boxes."""
+    name = type_of_schema(channel.schema_name)
+    return name if name is not None and MESSAGE_TYPES[name].pixel_x else None
 
 
 def _is_polar(channel: ChannelLike) -> bool:

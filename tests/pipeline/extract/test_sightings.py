@@ -11,6 +11,7 @@ from test_radar import on_board, polar
 from test_sensor_frames import MAST, TARGET, ros2_row, seen, ship
 
 from cadence.errors import InputError
+from pipeline.measurement_words import measurement_words
 from pipeline.measurements import read_measurements
 from schemas.tables import MEASUREMENTS
 
@@ -56,6 +57,8 @@ def test_compass_bearings_from_a_place(tmp_path: Path) -> None:
         "agents": {"fox": 8},
     }  # fmt: skip
     assert found.summary["num_detections"] == 5 and found.summary["suspicions"] == []
+    told = "8 bearings of /finder, which are no positions, weigh windows; about fox (8)"
+    assert measurement_words(found.summary["measurements"]) == told and measurement_words({}) == ""
 
 
 def test_logs_without_any_have_no_table(tmp_path: Path) -> None:

@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from pipeline.mapping.field_paths import coordinate_paths
+from pipeline.mapping.field_paths import coordinate_paths, measured_paths
 
 ROS = (
     "std_msgs/Header header\nown_msgs/Plot[] plots\n" + "=" * 80 + "\nMSG: own_msgs/Plot\nown_msgs/Where where\nfloat64 speed\n"
@@ -37,3 +37,18 @@ def test_coordinates(name: str, schema: str, expected: tuple[str, str] | None) -
 
 def test_bytes_that_are_no_text() -> None:
     assert coordinate_paths("own.Binary", b"\xff\x00") is None
+
+
+@pytest.mark.parametrize(
+    ("schema", "expected"),
+    [
+        ("own_msgs/Ray[] rays\n" + "=" * 80 + "\nMSG: own_msgs/Ray\nfloat32 azimuth_deg\n", {"bearing": "rays[:].azimuth_deg"}),
+        (
+            "float32 elevation\nfloat32 bearing\nfloat32 range\n",
+            {"range": "range", "bearing": "bearing", "elevation": "elevation"},
+        ),
+        ("float32 range\n", {}),
+    ],
+)
+def test_bearings(schema: str, expected: dict[str, str]) -> None:
+    assert measured_paths("own_msgs/msg/Rays", schema.encode()) == expected

@@ -219,3 +219,15 @@ def test_the_older_name_of_a_message_type_is_still_read() -> None:
     assert read_config(SourceConfig, older) == SourceConfig("/fix", message_type="NavSatFix")
     with pytest.raises(ConfigError, match="'preset' is the older name of 'message_type'; give one of the two"):
         read_config(SourceConfig, older | {"message_type": "NavSatFix"})
+
+
+def test_lines_for_bearings_and_boxes() -> None:
+    """What radars and cameras measured, with the accuracies that are taken, and what only the user can say."""
+    scans = suggest(("/radar", "radar_msgs/msg/RadarScan"))
+    assert "range_sigma_m = 0.5\nbearing_sigma_deg = 1.0" in scans.to_toml()
+    assert suggest(("/radar", "radar_msgs/msg/RadarScan"), ("/contacts/A", FIX)).detections[0].topic == "/contacts/{agent}"
+    boxes = suggest(("/boxes", "vision_msgs/msg/Detection2DArray")).to_toml()
+    assert '# message_type = "Detection2DArray"\n# agent = "NAME"' in boxes and "say whom they show" in boxes
+    own = FakeChannel("/contacts", "own/msg/Heard", b"float32 azimuth_deg\nfloat32 range\n")
+    lines = suggest_mapping([own]).to_toml()
+    assert '# bearing = "azimuth_deg"' in lines and '# bearing_unit = "deg"' in lines and "# range_sigma_m = 10.0" in lines
