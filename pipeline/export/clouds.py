@@ -27,7 +27,9 @@ _FIELDS = (
 )
 _HEAD_BYTES = 150
 _CLOUD_SHARE, _FIXES_SHARE = 0.18, 0.06
-"""Of the bytes of all hypotheses, which hardly compress; points do to about a half, fixes to a third."""
+"""Of what all hypotheses take in the file."""
+_PACKED_SHARE = 1.0 / 6.0
+"""So many bytes hypotheses take there for each that their floats have."""
 _POINT_BYTES, _FIX_BYTES = 8.0, 30.0
 """Of a point and of a fix in the file, about."""
 _NUM_FIXES = 10
@@ -47,7 +49,7 @@ def plan_clouds(
     ticks: Sequence[Tick], windows: Sequence[WindowHypotheses], num_hypotheses: int, is_georeferenced: bool
 ) -> CloudPlan:
     """As many, evenly, as fit into their shares of what the hypotheses take; always those of the first and the last tick."""
-    hypothesis_bytes = sum(agent.position_m.nbytes for window in windows for agent in window.agents)
+    hypothesis_bytes = _PACKED_SHARE * sum(agent.position_m.nbytes for window in windows for agent in window.agents)
     num_points = [_num_points(tick, num_hypotheses) for tick in ticks]
     num_fixes = [_num_points(tick, _NUM_FIXES) for tick in ticks]
     clouds = _chosen([num * _POINT_BYTES + _HEAD_BYTES for num in num_points], _CLOUD_SHARE * hypothesis_bytes)

@@ -1,4 +1,4 @@
-"""Messages of a side file: hypotheses (lossless), numbers a tick, detections, heat map, frames."""
+"""Messages of a side file: hypotheses, numbers a tick, detections, heat map, frames."""
 
 import math
 from collections.abc import Sequence
@@ -7,10 +7,12 @@ from typing import Any
 
 import numpy as np
 
+from cadence.arrays import Float32s
 from pipeline.ask.events import Event
 from pipeline.export import numbers
 from pipeline.export.occupancy import Occupancy
 from pipeline.export.playback import LiveAgent, Tick
+from pipeline.export.quantized import quantize
 from pipeline.logs.wire import field
 from pipeline.logs.writer import foxglove_class
 from pipeline.results import AgentHypotheses, WindowHypotheses
@@ -23,7 +25,7 @@ _UINT8, _FLOAT32 = 1, 7  # foxglove.PackedElementField.NumericType
 
 
 def encode_hypotheses(window: WindowHypotheses, frame: Frame, time_ns: int) -> bytes:
-    """cadence.Hypotheses with everything that the tables hold of one window."""
+    """cadence.Hypotheses with all that the tables hold of one window; tracks on grids far finer than their spread."""
     head = message_class("cadence.Hypotheses")(
         log_id=window.log_id,
         window=window.window,
@@ -40,10 +42,10 @@ def encode_hypotheses(window: WindowHypotheses, frame: Frame, time_ns: int) -> b
     )
     head.timestamp.FromNanoseconds(time_ns)
     # Fields may come in any order. A packed field is its bytes: no number passes through Python.
-    return b"".join([head.SerializeToString(), *(field(11, _encode_agent(agent)) for agent in window.agents)])
+    return b"".join([head.SerializeToString(), *(field(11, _encode_agent(agent, window.weight)) for agent in window.agents)])
 
 
-def _encode_agent(agent: AgentHypotheses) -> bytes:
+def _encode_agent(agent: AgentHypotheses, weight: Float32s) -> bytes:
     head = message_class("cadence.AgentHypotheses")(
         id=agent.agent_id,
         status=agent.status,
@@ -57,10 +59,20 @@ def _encode_agent(agent: AgentHypotheses) -> bytes:
         association_entropy_bits=agent.association_entropy_bits,
         num_effective=agent.num_effective,
     )
-    position: bytes = np.ascontiguousarray(agent.position_m, dtype="<f4").tobytes()
-    height = b"" if agent.height_m is None else np.ascontiguousarray(agent.height_m, dtype="<f4").tobytes()
-    fields = [field(number, data) for number, data in ((9, position), (13, height)) if data]
-    return b"".join([bytes(head.SerializeToString()), *fields])
+    parts = [bytes(head.SerializeToString()), _encode_tracks(agent.position_m, weight, 14, 9)]
+    if agent.height_m is not None:
+        parts.append(_encode_tracks(agent.height_m[..., None], weight, 15, 13))
+    return b"".join(parts)
+
+
+def _encode_tracks(track_m: Float32s, weight: Float32s, number: int, float_number: int) -> bytes:
+    """Tracks [K, T, D] as the field `number` of whole numbers, or as that of floats where they have gaps; nothing of none."""
+    if not track_m.size:
+        return b""
+    found = quantize(track_m, weight)
+    if found is None:
+        return field(float_number, np.ascontiguousarray(track_m, dtype="<f4").tobytes())
+    return field(number, found.encode())
 
 
 def encode_agents(tick: Tick, time_ns: int) -> bytes:
@@ -100,17 +112,34 @@ def _to_plot(value: float) -> float:
     return round(value * 1024.0) / 1024.0
 
 
+def _to_accuracy(value_m: float, variance_m2: float | None) -> float:
+    """Rounded by at most a hundredth of its standard deviation, as a power of two; as it is where that is not known."""
+    if variance_m2 is None or not 0.0 < variance_m2 < math.inf:
+        return value_m
+    quantum_m = 2.0 ** math.floor(math.log2(0.02 * math.sqrt(variance_m2)))
+    return round(value_m / quantum_m) * quantum_m
+
+
+def _to_digits(value: float) -> float:
+    """Rounded to sixteen binary digits, four decimal ones: covariances of correlation 0.999 stay positive definite."""
+    fraction, exponent = math.frexp(value)
+    return math.ldexp(round(fraction * 65536.0) / 65536.0, exponent)
+
+
 def encode_detection(row: dict[str, Any], frame: Frame, time_ns: int, sources: Sequence[dict[str, Any]] = ()) -> bytes:
     """cadence.Detection from a row of DETECTIONS, and where its origin is unknown from the rows of ASSOCIATIONS on it."""
     message = message_class("cadence.Detection")(frame_id=frame.frame_id)
     message.timestamp.FromNanoseconds(time_ns)
-    for name in ("agent_id", "sensor_id", "x_m", "y_m", "num_merged", "topic", "log_time_ns", "sequence"):
+    for name in ("agent_id", "sensor_id", "num_merged", "topic", "log_time_ns", "sequence"):
         if row[name] is not None:
             setattr(message, name, row[name])
-    for name in ("z_m", "cov_xx_m2", "cov_xy_m2", "cov_yy_m2", "cov_zz_m2", "score"):
+    for name, variance in (("x_m", "cov_xx_m2"), ("y_m", "cov_yy_m2"), ("z_m", "cov_zz_m2")):
+        if row[name] is not None and math.isfinite(row[name]):
+            setattr(message, name, _to_accuracy(row[name], row.get(variance)))
+    for name in ("cov_xx_m2", "cov_xy_m2", "cov_yy_m2", "cov_zz_m2", "score"):
         value = row.get(name)
         if value is not None and math.isfinite(value):
-            setattr(message, name, value)
+            setattr(message, name, _to_digits(value))
     if sources:
         _add_association(message.association, sources)
     data: bytes = message.SerializeToString()

@@ -8,6 +8,8 @@ from cadence.arrays import Float64s
 from pipeline.export.playback import LiveAgent
 
 _CELLS_OF_A_FUTURE = 96
+_LEVELS = 128.0
+"""Of probability: thirty hypotheses tell fewer apart, and what stands behind them is noise that takes room."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,8 +48,14 @@ def future_occupancy(live: tuple[LiveAgent, ...], max_cells: int) -> Occupancy |
         # An agent that is part of some hypotheses only has their weights among all of them.
         share = agent.weight if agent.agent.probability is None else agent.window.weight[agent.hypothesis]
         weight[agent.hypothesis] = np.maximum(weight[agent.hypothesis], share)
-    probability = np.clip(weight @ is_visited, 0.0, 1.0).reshape(height, width)
+    probability = _levelled(np.clip(weight @ is_visited, 0.0, 1.0)).reshape(height, width)
     return Occupancy(float(first[0] * cell_m), float(first[1] * cell_m), float(cell_m), probability)
+
+
+def _levelled(probability: Float64s) -> Float64s:
+    """Rounded to levels; what is possible at all stays so."""
+    level = np.maximum(np.round(probability * _LEVELS), 1.0) / _LEVELS
+    return np.where(probability > 0.0, level, 0.0)
 
 
 def _dense(track_m: Float64s, spacing_m: float) -> Float64s:

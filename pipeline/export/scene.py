@@ -90,11 +90,11 @@ def encode_time(time_ns: int) -> bytes:
 
 
 def round_positions(position_m: Floats, reach_m: float) -> Float64s:
-    """Positions on a grid of half a metre for a drawing a kilometre wide, finer and coarser in proportion (powers of two).
+    """Positions on a grid of a metre for a drawing a kilometre wide, finer and coarser in proportion (powers of two).
 
     The eye cannot tell, and the zero bits at the end of every number compress well.
     """
-    quantum = 2.0 ** np.round(np.log2(max(reach_m, 1e-6) / 2048.0))
+    quantum = 2.0 ** np.round(np.log2(max(reach_m, 1e-6) / 1024.0))
     # Adding zero turns -0.0 into 0.0.
     rounded: Float64s = np.round(np.asarray(position_m, np.float64) / quantum) * quantum + 0.0
     return rounded

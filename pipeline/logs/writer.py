@@ -105,7 +105,7 @@ def foxglove_class(name: str) -> Any:
 def schema_bytes(name: str) -> bytes:
     """A serialised FileDescriptorSet with the message `name` and all that it depends on, dependencies first."""
     if name.startswith("cadence."):
-        return DESCRIPTOR_PATH.read_bytes()
+        return _pruned(descriptor_pb2.FileDescriptorSet.FromString(DESCRIPTOR_PATH.read_bytes()), name)
     found = descriptor_pb2.FileDescriptorSet()
     seen: set[str] = set()
 
@@ -117,5 +117,22 @@ def schema_bytes(name: str) -> bytes:
             file.CopyToProto(found.file.add())
 
     add(foxglove_class(name).DESCRIPTOR.file)
+    data: bytes = found.SerializeToString(deterministic=True)
+    return data
+
+
+def _pruned(found: descriptor_pb2.FileDescriptorSet, name: str) -> bytes:
+    """A FileDescriptorSet with those messages of its last file alone that `name` is made of: summaries are not compressed."""
+    ours = found.file[-1]
+    messages = {f".{ours.package}.{message.name}": message for message in ours.message_type}
+    needed, waiting = set[str](), [f".{name}"]
+    while waiting:
+        one = waiting.pop()
+        if one in messages and one not in needed:
+            needed.add(one)
+            waiting += [field.type_name for field in messages[one].field]
+    for index, kind in reversed(list(enumerate(messages))):
+        if kind not in needed:
+            del ours.message_type[index]
     data: bytes = found.SerializeToString(deterministic=True)
     return data

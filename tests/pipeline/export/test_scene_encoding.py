@@ -66,7 +66,7 @@ def test_time(time_ns):
 
 
 @pytest.mark.parametrize(
-    ("reach_m", "quantum_m"), [(1024.0, 1 / 2), (1000.0, 1 / 2), (700.0, 1 / 4), (8.0, 2**-8), (2.0e6, 1024.0)]
+    ("reach_m", "quantum_m"), [(1024.0, 1.0), (1000.0, 1.0), (700.0, 1 / 2), (8.0, 2**-7), (2.0e6, 2048.0)]
 )
 def test_rounding_follows_what_is_drawn(reach_m, quantum_m):
     rounded = round_positions(np.linspace(-reach_m, reach_m, 1001), reach_m)
