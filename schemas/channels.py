@@ -36,6 +36,8 @@ FIXES = Channel("/cadence/fixes", "foxglove.LocationFixes")
 DETECTIONS = Channel("/cadence/detections", "cadence.Detection")
 TRANSFORM = Channel("/cadence/tf", "foxglove.FrameTransform")
 MAP = Channel("/cadence/map", "foxglove.GeoJSON")
+MISSION = Channel("/cadence/mission", "cadence.MissionHypotheses")
+MISSION_SCENE = Channel("/cadence/mission_scene", "foxglove.SceneUpdate")
 EVENTS = Channel("/cadence/events", "foxglove.Event")
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from cadence.arrays import Bools, Float64s, Int64s
+from cadence.stories import Stories
 from pipeline.export import numbers
 from pipeline.export.playback import HEIGHT_COUNTS, LiveAgent, Scene
 from pipeline.export.scene import Entity, Label, Lines, LineType, Spheres, round_positions
@@ -30,6 +31,9 @@ _THIN_PX, _THICK_PX = (1.5, 1.0), (4.0, 2.5)
 
 _SEEN_SHARE = 1.0 / 400.0
 """Of what an agent's hypotheses reach: two or three pixels where they fill the screen."""
+
+_STORY_VERTICES = 256
+"""Points of a mission hypothesis, in the mean at most: it is drawn once, and far longer than a window."""
 
 _LARGEST_BALL = 2.5
 """How far the ball of an agent grows with its uncertainty, in sizes of its marks."""
@@ -171,6 +175,30 @@ def _hypothesis_lines(live: LiveAgent, style: Style) -> tuple[Lines, ...]:
         for rows, thickness_px in ((slice(None, -1), _THIN_PX), (slice(-1, None), _THICK_PX)):
             groups += _lines(place_m[rows, steps], is_vertex[rows, steps], color[rows], thickness_px[is_future])
     return tuple(groups)
+
+
+def story_entities(stories: Stories, style: Style) -> list[Entity]:
+    """The mission hypotheses of each agent as whole lines in its colour, as far as it is part of them."""
+    entities = []
+    for agent, name in enumerate(stories.agent_ids):
+        is_there = stories.is_present[:, agent]
+        rows = np.flatnonzero(is_there.any(axis=1))
+        if not len(rows):
+            continue
+        # Before its beginning and behind its end a line stays where it is, without a point there.
+        first, last = is_there[rows].argmax(axis=1), is_there.shape[1] - 1 - is_there[rows, ::-1].argmax(axis=1)
+        step = np.clip(np.arange(is_there.shape[1]), first[:, None], last[:, None])
+        track_m = seen_m = stories.position_m[rows[:, None], agent, step]
+        height_m = None
+        if stories.height_m is not None and np.isfinite(stories.height_m[:, agent]).any():
+            height_m = stories.height_m[rows[:, None], agent, step]
+            seen_m = np.concatenate([track_m, HEIGHT_COUNTS * np.nan_to_num(height_m, nan=style.z_m)[..., None]], axis=-1)
+        place_m = style.place(track_m, max(float(np.ptp(track_m, axis=(0, 1)).max()), 1e-3), height_m)
+        is_vertex = _vertices(seen_m, 0, _STORY_VERTICES)
+        alpha = _ALPHA_FLOOR + (_ALPHA_TOP - _ALPHA_FLOOR) * stories.weight[rows] / stories.weight[rows].max()
+        color = np.column_stack([np.tile(style.color(name)[:3], (len(rows), 1)), np.round(alpha * 64.0) / 64.0])
+        entities.append(Entity(f"mission/{name}", tuple(_lines(place_m, is_vertex, color, _THIN_PX[0]))))
+    return entities
 
 
 def _vertices(track_m: Float64s, origin_index: int, max_vertices: int) -> Bools:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from cadence.arrays import Float32s
+from cadence.arrays import Float32s, Floats
 from pipeline.ask.events import Event
 from pipeline.export import numbers
 from pipeline.export.occupancy import Occupancy
@@ -16,6 +16,7 @@ from pipeline.export.quantized import quantize
 from pipeline.logs.wire import field
 from pipeline.logs.writer import foxglove_class
 from pipeline.results import AgentHypotheses, WindowHypotheses
+from pipeline.stories import MissionStories
 from pipeline.tables import Frame
 from schemas import channels
 from schemas.channels import message_class
@@ -65,7 +66,7 @@ def _encode_agent(agent: AgentHypotheses, weight: Float32s) -> bytes:
     return b"".join(parts)
 
 
-def _encode_tracks(track_m: Float32s, weight: Float32s, number: int, float_number: int) -> bytes:
+def _encode_tracks(track_m: Floats, weight: Floats, number: int, float_number: int) -> bytes:
     """Tracks [K, T, D] as the field `number` of whole numbers, or as that of floats where they have gaps; nothing of none."""
     if not track_m.size:
         return b""
@@ -73,6 +74,38 @@ def _encode_tracks(track_m: Float32s, weight: Float32s, number: int, float_numbe
     if found is None:
         return field(float_number, np.ascontiguousarray(track_m, dtype="<f4").tobytes())
     return field(number, found.encode())
+
+
+def encode_mission(mission: MissionStories, agent: int, number: int, time_ns: int) -> bytes | None:
+    """cadence.MissionHypotheses of an agent in the block with this number; None where it is part of no story there."""
+    block, stories = mission.blocks[number], mission.stories
+    steps = slice(block.first, block.stop)
+    position_m, height_m = (
+        stories.position_m[:, agent, steps],
+        None if stories.height_m is None else stories.height_m[:, agent, steps],
+    )
+    is_there = np.isfinite(position_m[..., 0])
+    if not is_there.any():
+        return None
+    datum_m = np.round(position_m[is_there].mean(axis=0))
+    message = message_class("cadence.MissionHypotheses")(
+        log_id=mission.log_id,
+        frame_id=mission.frame.frame_id,
+        agent_id=stories.agent_ids[agent],
+        block=number,
+        start_ns=block.start_ns,
+        step_ns=block.step_ns,
+        num_steps=len(block),
+        hypothesis=range(stories.num_hypotheses),
+        weight=stories.weight.tolist(),
+        datum_x_m=datum_m[0],
+        datum_y_m=datum_m[1],
+    )
+    message.timestamp.FromNanoseconds(time_ns)
+    parts = [bytes(message.SerializeToString()), _encode_tracks(position_m - datum_m, stories.weight, 13, 14)]
+    if height_m is not None and not np.isnan(height_m).all():
+        parts.append(_encode_tracks(height_m[..., None], stories.weight, 15, 16))
+    return b"".join(parts)
 
 
 def encode_agents(tick: Tick, time_ns: int) -> bytes:

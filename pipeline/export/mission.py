@@ -17,6 +17,7 @@ from pipeline.export.playback import Scene, Tick, build_scenes, plan_ticks
 from pipeline.export.sizes import mark_sizes_m
 from pipeline.obstacle_file import OBSTACLES_NAME, read_obstacle_entries
 from pipeline.results import MissionHypotheses, read_hypothesis_tables
+from pipeline.stories import MISSION_NAME, MissionStories, read_stories
 from pipeline.tables import read_table
 from pipeline.tracks import UNKNOWN_AGENT, agent_tracks
 
@@ -31,7 +32,8 @@ _CLOCK_TOLERANCE_NS = 10 * 1_000_000_000
 class Exported:
     """All that is exported. Times are the clock of the detections; `clock_offset_ns` brings them to the log's.
 
-    `sources` holds the rows of ASSOCIATIONS by the row of their detection.
+    `stories` are as many mission hypotheses as are drawn, None where there are none; `sources` holds the rows of ASSOCIATIONS
+    by the row of their detection.
     """
 
     catalogue: Catalogue
@@ -45,6 +47,7 @@ class Exported:
     ticks: list[Tick]
     tick_s: float
     clock_offset_ns: int
+    stories: MissionStories | None = None
 
 
 def read_exported(directory: Path, catalogue: Catalogue, config: ExportConfig) -> Exported:
@@ -71,6 +74,7 @@ def read_exported(directory: Path, catalogue: Catalogue, config: ExportConfig) -
         ticks=plan_ticks(scenes, tick_ns, catalogue.end_ns - offset_ns) if scenes else [],
         tick_s=tick_ns * 1e-9,
         clock_offset_ns=offset_ns,
+        stories=read_stories(directory, config.num_scene_hypotheses) if (directory / MISSION_NAME).is_file() else None,
     )
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cadence.arrays import Float32s, Float64s, Int64s, UInt64s
+from cadence.arrays import Float64s, Floats, Int64s, UInt64s
 from pipeline.logs.wire import field
 
 _SHARE = 0.01
@@ -35,7 +35,7 @@ class Quantized:
         return b"".join(field(number, _varints(values)) for number, values in parts if values.size)
 
 
-def quantize(track_m: Float32s, weight: Float32s) -> Quantized | None:
+def quantize(track_m: Floats, weight: Floats) -> Quantized | None:
     """Tracks [K, T, D], each coordinate rounded by at most a hundredth of their spread at its step, or a micrometre.
 
     `weight` [K] counts in the spread. None where a track has gaps, which whole numbers cannot say.

@@ -13,7 +13,7 @@ from pipeline.config import config_as_dict
 from pipeline.export import maps, messages
 from pipeline.export.clouds import encode_cloud, encode_fixes, plan_clouds
 from pipeline.export.config import ExportConfig
-from pipeline.export.display import hypothesis_entities, obstacle_entities, present_entities
+from pipeline.export.display import hypothesis_entities, obstacle_entities, present_entities, story_entities
 from pipeline.export.inputs import EARLIER_STAGES
 from pipeline.export.layouts import MAX_PLOTTED, build_layout, build_legacy_layout
 from pipeline.export.mission import Exported, read_exported
@@ -99,6 +99,8 @@ def _in_order(mission: Exported, events: Sequence[Event], config: ExportConfig) 
     moments += [(row["time_ns"], 1, index) for index, row in enumerate(rows)]
     moments += [(tick.time_ns, 2, index) for index, tick in enumerate(ticks)]
     moments += [(event.start_ns, 3, index) for index, event in enumerate(events)]
+    if mission.stories is not None:
+        moments += [(block.start_ns, 4, index) for index, block in enumerate(mission.stories.blocks)]
     moments.sort()
     map_start_ns = maps.plan_map(ticks, config.map_period_s) if frame.is_georeferenced else {}
     fixes = maps.MovingFixes(frame, mission.style)
@@ -113,6 +115,11 @@ def _in_order(mission: Exported, events: Sequence[Event], config: ExportConfig) 
             yield from _detection(mission, rows[index], time_ns)
         elif kind == 3:
             yield time_ns, channels.EVENTS, messages.encode_event(events[index], mission.clock_offset_ns)
+        elif kind == 4 and mission.stories is not None:
+            for agent in range(len(mission.stories.stories.agent_ids)):
+                found = messages.encode_mission(mission.stories, agent, index, time_ns)
+                if found is not None:
+                    yield time_ns, channels.MISSION, found
         else:
             tick = ticks[index]
             if shows_new_scene(ticks, index):
@@ -136,6 +143,9 @@ def _static(mission: Exported, time_ns: int) -> Iterator[_Message]:
     if mission.obstacles:
         entities = obstacle_entities(mission.obstacles, mission.style)
         yield time_ns, channels.OBSTACLES, encode_scene(time_ns, frame.frame_id, entities)
+    if mission.stories is not None:
+        entities = story_entities(mission.stories.stories, mission.style)
+        yield time_ns, channels.MISSION_SCENE, encode_scene(time_ns, frame.frame_id, entities)
 
 
 def _detection(mission: Exported, row: dict[str, Any], time_ns: int) -> Iterator[_Message]:

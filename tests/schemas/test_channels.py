@@ -24,7 +24,9 @@ def test_descriptors_hold_their_imports_first():
     assert [file.name for file in files] == ["google/protobuf/timestamp.proto", "cadence.proto"]
 
 
-@pytest.mark.parametrize("name", ["Hypotheses", "AgentHypotheses", "Agents", "AgentState", "Detection", "Association"])
+@pytest.mark.parametrize(
+    "name", ["Hypotheses", "AgentHypotheses", "Agents", "AgentState", "Detection", "Association", "MissionHypotheses"]
+)
 def test_messages_are_found(name):
     message = message_class(f"cadence.{name}")()
     assert message.DESCRIPTOR.full_name == f"cadence.{name}"
@@ -43,7 +45,7 @@ def test_field_numbers_are_never_changed():
 
 def test_topics_are_unique_and_ours():
     found = [value for value in vars(channels).values() if isinstance(value, Channel)]
-    assert len({channel.topic for channel in found}) == len(found) == 13
+    assert len({channel.topic for channel in found}) == len(found) == 15
     assert all(channel.topic.startswith("/cadence/") for channel in found)
 
 
