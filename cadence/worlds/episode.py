@@ -30,6 +30,25 @@ class SensorReports:
 
 
 @dataclass(frozen=True, eq=False)
+class BearingReports:
+    """Bearings of one episode, ordered by step, then agent, then sensor: someone was heard, and from where.
+
+    step, agent, sensor  [N] indices
+    bearing_rad          [N] measured, from east towards north
+    sigma_rad            [N] standard deviation of its noise
+    """
+
+    step: Int64s
+    agent: Int64s
+    sensor: Int64s
+    bearing_rad: Float64s
+    sigma_rad: Float64s
+
+    def __len__(self) -> int:
+        return len(self.step)
+
+
+@dataclass(frozen=True, eq=False)
 class SensorLaw:
     """How surely a sensor detects a target that moves as targets here do, in one step.
 
@@ -55,6 +74,7 @@ class Episode:
     is_active [S, T] whether a sensor was looking
     goals_m   per agent [G, 2] the places it went for, in order
     laws      of every sensor, P(detect) over distance; none where a world does not say
+    bearings  of agents that were heard; None where nobody listens
     """
 
     world: str
@@ -70,6 +90,7 @@ class Episode:
     detections: SensorReports
     terrain: Terrain
     laws: tuple[SensorLaw, ...] = ()
+    bearings: BearingReports | None = None
 
     def __post_init__(self) -> None:
         agents, sensors, steps = len(self.agent_ids), len(self.sensor_ids), len(self.time_s)

@@ -24,7 +24,16 @@ from cadence.worlds.crews import (
     steer_smuggler,
 )
 from cadence.worlds.episode import Episode, SensorLaw, SensorReports
-from cadence.worlds.sensors import SensorKind, Sortie, draw_noise, measurement_covariance, sweep_track, swerling_probability
+from cadence.worlds.sensors import (
+    Listening,
+    SensorKind,
+    Sortie,
+    draw_noise,
+    hear,
+    measurement_covariance,
+    sweep_track,
+    swerling_probability,
+)
 from cadence.worlds.terrain import Terrain, blocks_segment, random_archipelago
 
 _NUM_POINTS = 26
@@ -44,6 +53,7 @@ class PatrolConfig:
     line_of_sight   whether land hides agents from the sensors at sea level
     side_m          side of the map
     num_boats, num_aircraft, num_masts  sensors of each kind
+    listening       direction finders on them
     """
 
     num_agents: int = 1
@@ -55,6 +65,7 @@ class PatrolConfig:
     num_boats: int = 3
     num_aircraft: int = 1
     num_masts: int = 2
+    listening: Listening = field(default_factory=Listening)
 
     def __post_init__(self) -> None:
         if self.num_agents < 1:
@@ -180,6 +191,10 @@ def simulate_patrol(config: PatrolConfig, rng: np.random.Generator) -> Episode:
             steer_smuggler(smuggler, sensors[:, step], is_active[:, step], kinds, sea, float(now), config.step_s, rng)
         for boat in boats:
             steer_boat(boat, sea, float(now), config.step_s)
+    bearings = None
+    if config.listening.kind != "none":  # from a stream of their own: all else stays as it was
+        listens = np.array([config.listening.kind in (kind.name, "both") and kind is not AIRCRAFT for kind in kinds])
+        bearings = hear(config.listening, truth, sensors, listens, rng.spawn(1)[0])
     return Episode(
         world="patrol",
         time_s=time_s,
@@ -194,6 +209,7 @@ def simulate_patrol(config: PatrolConfig, rng: np.random.Generator) -> Episode:
         detections=log.close(),
         terrain=terrain,
         laws=eyes.laws(),
+        bearings=bearings,
     )
 
 

@@ -2,10 +2,12 @@
 
 import math
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
 from cadence.arrays import Bools, Float64s
+from cadence.worlds.episode import BearingReports
 
 FALSE_ALARM = 1e-4
 """Probability of false alarm that the detection law of a radar is set to."""
@@ -62,6 +64,39 @@ def draw_noise(covariance_m2: Float64s, rng: np.random.Generator) -> Float64s:
     white = rng.standard_normal((*covariance_m2.shape[:-2], 2))
     noise: Float64s = (np.linalg.cholesky(covariance_m2) @ white[..., None])[..., 0]
     return noise
+
+
+@dataclass(frozen=True)
+class Listening:
+    """Direction finders on boats and masts, which hear agents when these use their radio: bearings without ranges.
+
+    kind        which sensors listen: "boat", "mast", "both" or "none"
+    radio_rate  share of the steps in which an agent uses its radio
+    range_m     how far it is heard, over land as well
+    sigma_deg   standard deviation of a bearing
+    """
+
+    kind: Literal["none", "boat", "mast", "both"] = "none"
+    radio_rate: float = 0.1
+    range_m: float = 20000.0
+    sigma_deg: float = 2.0
+
+    def __post_init__(self) -> None:
+        if not (0 < self.radio_rate <= 1 and self.range_m > 0 and 0 < self.sigma_deg <= 45):
+            raise ValueError("listening: radio_rate must lie in 0..1, range_m be above zero, and sigma_deg lie in 0..45")
+
+
+def hear(
+    listening: Listening, truth_m: Float64s, sensors_m: Float64s, does_listen: Bools, rng: np.random.Generator
+) -> BearingReports:
+    """What the sensors that listen [S] hear of agents: truth_m [A, T, 2], sensors_m [S, T, 2]."""
+    speaks = rng.random(truth_m.shape[:2]) < listening.radio_rate
+    offset = truth_m.transpose(1, 0, 2)[:, :, None] - sensors_m.transpose(1, 0, 2)[:, None]
+    is_near = np.hypot(offset[..., 0], offset[..., 1]) <= listening.range_m
+    step, agent, sensor = np.nonzero(speaks.T[:, :, None] & is_near & does_listen)
+    sigma = np.full(len(step), np.radians(listening.sigma_deg))
+    east, north = offset[step, agent, sensor].T
+    return BearingReports(step, agent, sensor, np.arctan2(north, east) + sigma * rng.standard_normal(len(step)), sigma)
 
 
 @dataclass(frozen=True)

@@ -50,7 +50,7 @@ class ChannelReader:
             raise ConfigError(f"extract.{role}, topic {channel.topic}: ranges and bearings are detections; name other topics")
         self.paths, self.is_polar, self.is_geodetic = paths, paths.is_polar, bool(paths.latitude)
         self.names = {"agent": named.get("agent", source.agent), "sensor": named.get("sensor", source.sensor)}
-        self.is_camera = bool(paths.pixel_x)
+        self.is_camera, self.has_observer = bool(paths.pixel_x), bool(source.observer_place or paths.observer)
         names = _PIXELS if self.is_camera else _POLAR if self.is_polar else _GEODETIC if self.is_geodetic else _METRIC
         alternatives = [getattr(paths, name) for name in names]
         self.alternatives, self.json_text = paths.alternatives, paths.json_text
@@ -200,20 +200,18 @@ class ChannelReader:
             return self._alone(position, message)
         firsts, seconds = position[0].located(message), position[1].located(message)
         if firsts is None or seconds is None:
-            return None
+            return None if not self.is_polar else self._alone(position, message)
         zs = position[2].located(message) or {}
         points = [(place, first, seconds[place], at_place(zs, place)) for place, first in firsts.items() if place in seconds]
         self.counts["incomplete"] += len(firsts.keys() | seconds.keys()) - len(points)
         return points
 
     def _alone(self, position: Sequence[FieldReader], message: Any) -> list[Point] | None:
-        """The items of a source of ranges without bearings, or of bearings without ranges."""
-        is_range = bool(position[0].paths)
-        found = position[0 if is_range else 1].located(message)
-        if found is None:
-            return None
-        zs = position[2].located(message) or {}
-        return [(place, *((value, None) if is_range else (None, value)), at_place(zs, place)) for place, value in found.items()]
+        """The items of ranges without bearings, or of bearings without ranges."""
+        ranges, bearings, zs = (reader.located(message) or {} for reader in position)
+        return [
+            (place, ranges.get(place), bearings.get(place), at_place(zs, place)) for place in {**ranges, **bearings}
+        ] or None
 
     def _covariance(self, matrix: Any, kind: Any, sigma_m: Any) -> Covariance:
         """What is unknown takes the stated accuracy, else the source's sigma_m; so does what is none, which is counted."""

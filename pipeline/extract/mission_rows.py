@@ -102,12 +102,12 @@ def _from_observers(
     measuring = [role for role in ("detections", SIGHTINGS) if role in parts]
     if SIGHTINGS in parts:
         found[SIGHTINGS] = [in_pairs(rows) for rows in timed[SIGHTINGS]]
-    if any(reader.source.has_observer for role in measuring for reader, _ in parts[role]):
+    if any(reader.has_observer for role in measuring for reader, _ in parts[role]):
         about = [each for _, each in _in_place("poses", parts["poses"], timed["poses"], suspicions)]
         poses = Positions.concatenate(about or [Rows().finish()])
         for role in measuring:
             found[role] = [
-                from_observer(reader.source, each, poses, limits, counts) if reader.source.has_observer else each
+                from_observer(reader, each, poses, limits, counts) if reader.has_observer else each
                 for (reader, _), each in zip(parts[role], found[role], strict=True)
             ]
     if SIGHTINGS in parts:

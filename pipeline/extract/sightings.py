@@ -73,8 +73,11 @@ def read_parts(
             positions += [(reader, rows)]
             continue
         is_named = np.array([name is not None and name in known for name in rows.agent], dtype=np.bool_)
-        is_apart = each.is_bent & is_named
         is_place = bool(reader.paths.range and reader.paths.bearing)
+        has_name = np.array([name is not None for name in rows.agent], dtype=np.bool_)
+        # of a source of both, somebody may send one alone; what cannot be meant is stated, and left out
+        is_alone = has_name & (np.isnan(rows.first) != np.isnan(rows.second))
+        is_apart = (each.is_bent & is_named) | is_alone
         if is_place:
             positions += [(reader, as_positions(rows, each)[~is_apart])]
         others = _sightings(rows, each, is_apart | (not is_place))
@@ -126,7 +129,7 @@ def together(parts: Sequence[Positions]) -> Sightings:
     return both[np.argsort(both.time_ns, kind="stable")]
 
 
-def measurement_rows(placed: Sightings, height_topics: Collection[str]) -> MeasurementRows:
+def measurement_rows(placed: Sightings, poses: Positions, height_topics: Collection[str]) -> MeasurementRows:
     """Paired sightings in the mission frame as measurements [M]; those of which an end was lost on the way are left out.
 
     Heights of sensors count on `height_topics` only, where they are above what those of detections are.
@@ -155,25 +158,29 @@ def measurement_rows(placed: Sightings, height_topics: Collection[str]) -> Measu
         for name, value, sigma in zip(names, values.values(), sigmas, strict=True)
     }
     return MeasurementRows(
-        sensors.time_ns, sensors.sensor, sensors.agent, place_m, _velocities(sensors), **values, **exact,
+        sensors.time_ns, sensors.sensor, sensors.agent, place_m, _velocities(sensors, poses), **values, **exact,
         topic=sensors.topic, log_time_ns=sensors.log_time_ns, sequence=sensors.sequence,
     )  # fmt: skip
 
 
-def _velocities(sensors: Positions) -> Float64s:
-    """How observers [N], by time, moved [N, 2]; NaN where their own places do not tell."""
+def _velocities(sensors: Positions, poses: Positions) -> Float64s:
+    """How observers [N], by time, moved [N, 2], by their poses, else by where they measured; NaN where these do not tell."""
     found = np.full((len(sensors), 2), np.nan)
-    place_m = np.column_stack([sensors.first, sensors.second])
     keys = np.column_stack([sensors.topics.number, sensors.sensors.number])
     for key in np.unique(keys, axis=0):
         rows = np.flatnonzero((keys == key).all(axis=1))
-        time_s = (sensors.time_ns[rows] - sensors.time_ns[rows[0]]) * 1e-9
-        first = np.maximum(np.searchsorted(time_s, time_s - _PACE_S, "right") - 1, 0)
-        last = np.minimum(np.searchsorted(time_s, time_s + _PACE_S, "left"), len(rows) - 1)
-        span_s = time_s[last] - time_s[first]
-        is_known = (span_s > 0) & (span_s <= _MOST_S)
-        moved = place_m[rows[last]] - place_m[rows[first]]
-        found[rows[is_known]] = moved[is_known] / span_s[is_known, None]
-        if (place_m[rows] == place_m[rows[0]]).all():
-            found[rows] = 0.0
+        name = sensors.sensor[rows[0]]
+        track = poses[np.array([name is not None and each == name for each in poses.sensor], dtype=np.bool_)]
+        found[rows] = _velocity(track if len(track) > 1 else sensors[rows], sensors.time_ns[rows])
     return found
+
+
+def _velocity(track: Positions, at_ns: Int64s) -> Float64s:
+    """The velocity [M, 2] of a track [N] at moments [M], from a second before to a second after, as it has places there."""
+    time_ns, first = np.unique(track.time_ns, return_index=True)
+    place_m, pace_ns = np.column_stack([track.first, track.second])[first], round(_PACE_S * 1e9)
+    before = np.maximum(np.searchsorted(time_ns, at_ns - pace_ns, "right") - 1, 0)
+    after = np.minimum(np.searchsorted(time_ns, at_ns + pace_ns, "left"), len(time_ns) - 1)
+    moved, span_s = place_m[after] - place_m[before], (time_ns[after] - time_ns[before]) * 1e-9
+    is_known = ((span_s > 0) & (span_s <= _MOST_S)) | (place_m == place_m[0]).all()
+    return np.where(is_known[:, None], moved / np.maximum(span_s, 1e-9)[:, None], np.nan)

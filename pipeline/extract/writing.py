@@ -120,7 +120,9 @@ def _write_measurements(
     if not isinstance(sightings, Sightings):
         return {}
     datum = frame.vertical_datum
-    found = measurement_rows(sightings, {r.channel.topic for r in readers if datum is not None and r.vertical_datum == datum})
+    found = measurement_rows(
+        sightings, rows["poses"], {r.channel.topic for r in readers if datum is not None and r.vertical_datum == datum}
+    )
     if not len(found):
         return {}
     write_measurements(folder, log_id, found, frame)

@@ -79,7 +79,7 @@ def suggest_mapping(channels: Sequence[ChannelLike]) -> SuggestedMapping:
         return [c for c in channels if roles.get(c.topic) == role and usable_type(c) and c.message_count != 0]
 
     detecting = readable("detections")
-    positions = [channel for channel in detecting if not _is_polar(channel)]
+    positions = [channel for channel in detecting if not _is_returns(channel)]
     spare = [channel for channel in detecting if positions and channel not in positions]
     used = positions or detecting
     unused = {c.topic: why for c in channels if c.message_count != 0 and (why := _why_unused(c, roles.get(c.topic)))}
@@ -245,9 +245,10 @@ def _boxes_of(channel: ChannelLike) -> str | None:
     return name if name is not None and MESSAGE_TYPES[name].pixel_x else None
 
 
-def _is_polar(channel: ChannelLike) -> bool:
+def _is_returns(channel: ChannelLike) -> bool:
+    """Whether it holds what a radar measures before somebody says what of it is a target."""
     known = usable_type(channel)
-    return known is not None and MESSAGE_TYPES[known].is_polar
+    return known is not None and MESSAGE_TYPES[known].is_polar and not MESSAGE_TYPES[known].names_agents
 
 
 def _entry(role: str, source: SourceConfig) -> str:

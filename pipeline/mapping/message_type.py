@@ -17,6 +17,8 @@ PATHS: Final = (
 """The fields of a message type that are message paths."""
 
 AngleUnit = Literal["rad", "deg"]
+OWN_SENSOR: Final = "{sensor}"
+"""An observer that is the sensor of each measurement."""
 BearingConvention = Literal["math", "compass"]
 """What a bearing counts from, and which way: from x (ahead, or east) towards y; or from north (or ahead) clockwise."""
 
@@ -39,6 +41,7 @@ class MessageType:
     pixel_x, pixel_y, box_width, box_height  what a camera saw: right and down from the corner of its image, and how large
     bearing_unit     of bearing, elevation and their standard deviations
     bearing_convention  what a bearing counts from
+    observer         from whose poses was measured, by default; "{sensor}": those of the sensor that a message names
     where            conditions (see `conditions`); those hold whose fields a message has
     alternatives     of positions; "first": the first that a message has. "filled": item by item the first that is not zero.
                      "all": every one of them holds positions of its own
@@ -79,6 +82,7 @@ class MessageType:
     range_rate_sigma_mps: float | None = None
     bearing_unit: AngleUnit = "rad"
     bearing_convention: BearingConvention = "math"
+    observer: str | None = None
     where: tuple[str, ...] = ()
     time: Paths = TIME_PATHS
     frame_id: Paths = FRAME_PATHS

@@ -3,7 +3,7 @@
 from dataclasses import replace
 from typing import Final
 
-from pipeline.mapping.message_type import MessageType
+from pipeline.mapping.message_type import OWN_SENSOR, MessageType
 
 _RADAR: Final = MessageType(
     (), range_sigma_m=0.5, bearing_sigma_deg=1.0, elevation_sigma_deg=2.0, vertical_datum="frame", role="detections"
@@ -42,5 +42,19 @@ RADARS: Final[dict[str, MessageType]] = {
         bearing_sigma=("detections[:].azimuth_angle_std",),
         elevation_sigma=("detections[:].elevation_angle_std",),
         range_rate_sigma=("detections[:].range_rate_std",),
+    ),
+    "Bearing": MessageType(
+        ("mission.Bearing",),
+        range=("range",),
+        bearing=("bearing",),
+        range_sigma=("range_sigma",),
+        bearing_sigma=("bearing_sigma",),
+        bearing_unit="deg",
+        bearing_convention="compass",
+        observer=OWN_SENSOR,
+        agent=("agent_id",),
+        sensor=("sensor_id",),
+        role="detections",
+        names_agents=True,
     ),
 }

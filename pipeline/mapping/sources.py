@@ -80,8 +80,8 @@ class SourceConfig:
     box_width, box_height   message paths of its size in pixels, of which a tenth is the standard deviation (one at least)
     pixel_sigma   standard deviation in pixels instead
     camera_info topic of the camera's sensor_msgs/CameraInfo; default: the one whose name is nearest
-    observer    the sensor of [[extract.poses]] from whose places it was measured; default: the origin of the frame that
-                frame_id names, at the stamp, by the log's transforms
+    observer    the sensor of [[extract.poses]] from whose places it was measured; "{sensor}": the one that the message or the
+                topic names; default: the origin of the frame that frame_id names, at the stamp, by the log's transforms
     observer_x_m, observer_y_m   where it was measured from, in the mission frame, where that stands
     observer_latitude, observer_longitude   the same in degrees
     observer_heading_deg   clockwise from north, where bearings of an observer count from ahead of it
@@ -196,9 +196,13 @@ class SourceConfig:
             )
 
     @property
-    def has_observer(self) -> bool:
-        """Whether it says from where was measured, instead of a frame."""
-        return self.observer is not None or self.observer_x_m is not None or self.observer_latitude is not None
+    def observer_place(self) -> tuple[float, float] | None:
+        """Where it was measured from, if that stands: metres, or latitude and longitude."""
+        if self.observer_x_m is not None and self.observer_y_m is not None:
+            return self.observer_x_m, self.observer_y_m
+        if self.observer_latitude is not None and self.observer_longitude is not None:
+            return self.observer_latitude, self.observer_longitude
+        return None
 
     def _check_identity(self) -> None:
         found = re.findall(r"\{(.*?)\}", self.topic)
@@ -276,7 +280,7 @@ def _check_measured(source: SourceConfig, found: MessageType) -> None:
         has_sigma = getattr(found, f"{name}_sigma") or getattr(found, setting) is not None
         if getattr(source, name) is not None and not has_sigma:
             raise ConfigError(f"{where}: nothing says how exact its {name} is; give {setting}, or the path {name}_sigma")
-    if found.bearing_convention == "compass" and not source.has_observer:
+    if found.bearing_convention == "compass" and found.observer is None and source.observer_place is None:
         raise ConfigError(
             f"{where}: compass bearings are of a place, and nothing says which; give observer (a sensor of [[extract.poses]]), "
             "observer_x_m and observer_y_m, or observer_latitude and observer_longitude"

@@ -24,7 +24,7 @@ class Report:
     """A position at a time. x and y are metres, or, for geodetic forms, longitude and latitude in degrees.
 
     covariance_m2 is xx, xy, yy (east, north); None for truth and poses. The identities are written where a form has room.
-    Forms of several positions write `group`, x and y each, and not x and y.
+    Forms of several positions write `group`, x and y each, and not x and y. Forms of bearings write `measured`.
     """
 
     time_ns: int
@@ -35,6 +35,7 @@ class Report:
     agent_id: str = ""
     sensor_id: str = ""
     group: tuple[tuple[float, float], ...] = ()
+    measured: tuple[tuple[str, float], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -186,6 +187,18 @@ def _json_detection_form() -> Form:
             "position": {"x": report.x, "y": report.y, "z": 0.0},
             "position_covariance": _covariance9(report),
         },
+        has_agent_id=True,
+    )
+
+
+def bearing_form() -> Form:
+    """The form of bearings, in whatever encoding: no standard type of messages has bearings from true north."""
+    words = {name: {"type": "string"} for name in ("agent_id", "sensor_id")}
+    numbers = {name: {"type": "number"} for name in ("bearing", "bearing_sigma", "range", "range_sigma")}
+    return _json_form(
+        "mission.Bearing",
+        words | numbers,
+        lambda report: {"agent_id": report.agent_id, "sensor_id": report.sensor_id, **dict(report.measured)},
         has_agent_id=True,
     )
 

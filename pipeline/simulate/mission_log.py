@@ -2,7 +2,7 @@
 
 Topics: /truth/AGENT (positions), /sensors/SENSOR/pose (positions) or /trackers (all sensors that move in one message),
 /detections (messages that name agent and sensor, or do not know them) or /detections/AGENT (messages that have no field for the
-agent),
+agent), /bearings (mission.Bearing: who was heard, and from where), with ranges in place of /detections where these are polar,
 /scene/obstacles (foxglove.SceneUpdate, protobuf always).
 Metadata records: `mission` (JSON values: how the log came about), `cadence.obstacles` (key `obstacles`: the list of
 obstacles.json, in the mission frame, whose datum stands beside it), `cadence.sensors` (key `sensors`: entries of
@@ -10,7 +10,7 @@ obstacles.json, in the mission frame, whose datum stands beside it), `cadence.se
 """
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,7 @@ from cadence.worlds.terrain import Terrain
 from pipeline.frames import to_geodetic
 from pipeline.obstacle_file import obstacles_as_json
 from pipeline.provenance import versions
-from pipeline.simulate.forms import Encoding, Form, Report, detection_form, group_form, pose_form, protobuf_schema
+from pipeline.simulate.forms import Encoding, Form, Report, bearing_form, detection_form, group_form, pose_form, protobuf_schema
 from pipeline.tables import Frame
 
 SCENE_PERIOD_S = 60.0
@@ -46,7 +46,7 @@ class MissionForm:
 
     With `groups_trackers` the sensors that move are one message a step, and those that do not are left to the Metadata
     record; no message type has latitudes and longitudes of several, so geodetic logs write every sensor apart. Without
-    `names_agents` nothing tells which agent a detection is of.
+    `names_agents` nothing tells which agent a detection is of. With `is_polar` detections are ranges and bearings.
     """
 
     encoding: Encoding
@@ -54,6 +54,7 @@ class MissionForm:
     start_ns: int
     groups_trackers: bool = False
     names_agents: bool = True
+    is_polar: bool = False
 
     @property
     def is_geodetic(self) -> bool:
@@ -164,7 +165,9 @@ def _write_messages(writer: Writer, episode: Episode, form: MissionForm) -> None
         for sensor, name in enumerate(episode.sensor_ids if group is None else ()):
             if moves[sensor] or is_slow_tick:
                 topics.write(f"/sensors/{name}/pose", poses, Report(time_ns, frame_id, *sensors[sensor, step].tolist()))
-        for row in range(first[step], last[step]):
+        for topic, report in _bearings(episode, step, time_ns, form):
+            topics.write(topic, bearing_form(), report)
+        for row in range(first[step], last[step]) if not form.is_polar else ():
             agent_id = _name(episode.agent_ids, int(seen.agent[row])) if form.names_agents else ""
             sensor_id = _name(episode.sensor_ids, int(seen.sensor[row]))
             (xx, xy), (_, yy) = np.round(seen.covariance_m2[row], 3).tolist()
@@ -172,6 +175,36 @@ def _write_messages(writer: Writer, episode: Episode, form: MissionForm) -> None
             report = Report(time_ns, frame_id, x, y, (xx, xy, yy), agent_id, sensor_id)
             is_apart = agent_id and not detections.has_agent_id
             topics.write(f"/detections/{agent_id}" if is_apart else "/detections", detections, report)
+
+
+def _bearings(episode: Episode, step: int, time_ns: int, form: MissionForm) -> Iterator[tuple[str, Report]]:
+    """What was heard in a step, and with ranges what was detected, if that is written so."""
+    heard, seen, frame_id = episode.bearings, episode.detections, form.frame.frame_id
+
+    def report(agent: int, sensor: int, **measured: float) -> Report:
+        values = tuple((name, round(value, 4)) for name, value in measured.items())
+        names = episode.agent_ids[agent], episode.sensor_ids[sensor]
+        return Report(time_ns, frame_id, 0.0, 0.0, None, *names, measured=values)
+
+    if heard is not None:
+        for row in range(*np.searchsorted(heard.step, [step, step + 1]).tolist()):
+            bearing_deg, sigma_deg = _compass_deg(heard.bearing_rad[row]), float(np.degrees(heard.sigma_rad[row]))
+            yield "/bearings", report(heard.agent[row], heard.sensor[row], bearing=bearing_deg, bearing_sigma=sigma_deg)
+    if form.is_polar:
+        for row in range(*np.searchsorted(seen.step, [step, step + 1]).tolist()):
+            offset = seen.position_m[row] - episode.sensors_m[seen.sensor[row], step]
+            range_m = float(np.hypot(*offset))
+            along = offset / range_m
+            across = np.array([-along[1], along[0]])
+            sigmas = [float(np.sqrt(way @ seen.covariance_m2[row] @ way)) for way in (along, across)]
+            measured = {"range": range_m, "range_sigma": sigmas[0], "bearing": _compass_deg(np.arctan2(*offset[::-1]))}
+            sigma_deg = float(np.degrees(sigmas[1] / range_m))
+            yield "/detections", report(seen.agent[row], seen.sensor[row], **measured, bearing_sigma=sigma_deg)
+
+
+def _compass_deg(bearing_rad: float) -> float:
+    """Clockwise from north of an angle from east towards north."""
+    return float((90.0 - np.degrees(bearing_rad)) % 360.0)
 
 
 def _name(names: Sequence[str], index: int) -> str:

@@ -52,6 +52,7 @@ class SimulateConfig:
                                  rendezvous, its south-west corner in prison and narco
     frame_id        name of the frame in the messages
     start_time_s    Unix time of the first message
+    is_polar        of patrol: detections as ranges and bearings from their sensors (mission.Bearing) instead of positions
     """
 
     world: Literal["patrol", "prison", "narco", "rendezvous"] = "patrol"
@@ -64,6 +65,7 @@ class SimulateConfig:
     longitude_deg: float = 20.3
     start_time_s: int = 1700000000
     frame_id: str = "map"
+    is_polar: bool = False
     patrol: PatrolConfig = field(default_factory=PatrolConfig)
     prison: PrisonConfig = field(default_factory=PrisonConfig)
     narco: NarcoConfig = field(default_factory=NarcoConfig)
@@ -77,6 +79,9 @@ class SimulateConfig:
         if not (abs(self.latitude_deg) <= 85.0 and abs(self.longitude_deg) <= 180.0):
             raise ValueError(f"the datum {self.latitude_deg}, {self.longitude_deg} is not within 85 degrees of the equator")
 
+        if self.is_polar and self.world != "patrol":
+            raise ValueError(f"is_polar is of the world patrol; of {self.world} nobody knows which sensor measured")
+
     @property
     def stem(self) -> str:
         """What the names of the logs begin with."""
@@ -89,7 +94,9 @@ class SimulateConfig:
         start_ns = self.start_time_s * 1_000_000_000
         is_unknown = self.world == "rendezvous" and not self.rendezvous.is_origin_known
         groups_trackers = self.world in ("prison", "narco")
-        return MissionForm(self.encoding, Frame(self.frame_id, *datum), start_ns, groups_trackers, names_agents=not is_unknown)
+        return MissionForm(
+            self.encoding, Frame(self.frame_id, *datum), start_ns, groups_trackers, not is_unknown, self.is_polar
+        )
 
 
 @dataclass(frozen=True)
@@ -154,6 +161,11 @@ def _key(config: SimulateConfig, index: int) -> str:
     """What an episode's bytes depend on, as a hash."""
     settled = config_as_dict(replace(config, num_episodes=1, first_index=index))
     settled = {name: value for name, value in settled.items() if name == config.world or not isinstance(value, dict)}
+    # what is off makes the bytes that it made before there was such a setting
+    off = config_as_dict(SimulateConfig())
+    settled = {name: value for name, value in settled.items() if name != "is_polar" or value != off[name]}
+    if config.world == "patrol" and settled["patrol"]["listening"] == off["patrol"]["listening"]:
+        settled["patrol"] = {name: value for name, value in settled["patrol"].items() if name != "listening"}
     made_by = {name: versions()[name] for name in ("cadence", "numpy", "mcap")}
     text = json.dumps({"config": settled, "version": VERSION, "made_by": made_by}, sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()

@@ -58,7 +58,7 @@ def miss_m(directory: Path) -> float:
     window = next(one for one in read_hypothesis_tables(directory).windows if one.origin_ns >= heard_ns)
     agent = next(agent for agent in window.agents if agent.agent_id == "T0")
     step = 15 + round((heard_ns - window.origin_ns) / 2e9)
-    place = agent.position_m[:, step] - MAST
+    place = agent.position_m[:, step] + np.array(agent.datum_m) - MAST
     line = (MIDDLE - MAST) / np.linalg.norm(MIDDLE - MAST)
     return float(window.weight @ np.abs(place[:, 0] * line[1] - place[:, 1] * line[0]))
 
