@@ -4,7 +4,8 @@ import subprocess
 import sys
 from pathlib import Path
 
-from fixtures.batch import FLAGS, write_tiny_logs
+import pytest
+from fixtures.batch import FLAGS, start, write_tiny_logs
 
 HEAVY = ("torch", "scipy", "shapely", "pyproj", "matplotlib")
 
@@ -22,16 +23,25 @@ def run(*arguments: object) -> str:
     return subprocess.run(command, check=True, capture_output=True, text=True).stdout
 
 
-def test_a_finished_mission_is_skipped_without_what_computes(tmp_path: Path) -> None:
-    logs = write_tiny_logs(tmp_path / "logs", 1)
-    first, second = (run(logs, "--out", tmp_path / "out") for _ in range(2))
-    assert "loaded: " in first and "torch" in first.splitlines()[-1]
-    assert "skipped" in second
-    assert second.splitlines()[-1] == "loaded:"
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """A log, and where its run is finished."""
+    logs = write_tiny_logs(tmp_path_factory.mktemp("finished") / "logs", 1)
+    process = start(logs, "--out", logs.parent / "out")
+    process.join()
+    assert process.exitcode == 0
+    return logs, logs.parent / "out"
 
 
-def test_a_changed_setting_of_one_stage_is_done_again(tmp_path: Path) -> None:
-    logs = write_tiny_logs(tmp_path / "logs", 1)
-    run(logs, "--out", tmp_path / "out")
-    assert "done" in run(logs, "--out", tmp_path / "out", "--set", "report.num_moments=2")
-    assert "skipped" in run(logs, "--out", tmp_path / "out", "--set", "report.num_moments=2")
+def test_a_finished_mission_is_skipped_without_what_computes(finished: tuple[Path, Path]) -> None:
+    logs, out = finished
+    said = run(logs, "--out", out)
+    assert "skipped" in said
+    assert said.splitlines()[-1] == "loaded:"
+
+
+def test_a_changed_setting_of_one_stage_is_done_again(finished: tuple[Path, Path]) -> None:
+    logs, out = finished
+    said = run(logs, "--out", out, "--set", "report.num_moments=2")
+    assert "done" in said and "torch" in said.splitlines()[-1]
+    assert "skipped" in run(logs, "--out", out, "--set", "report.num_moments=2")
