@@ -21,6 +21,7 @@ from cadence.bank.mixture import (
     Numbers,
     at_node,
     choose_models,
+    drawn_pairs,
     merge_grid,
     mixture_moments,
     random_numbers,
@@ -253,6 +254,11 @@ def _smooth_rows(
 ) -> _Smoothed:
     """Filter, smooth and sample every pair of row and chosen model, and mix the models of each row."""
     nodes, step_index = merge_grid(rows, time_s)
+    num_nodes = nodes.time_s.shape[1]
+    numbers = random_numbers(chosen.weight, rows, seeds, num_hypotheses, num_nodes, len(time_s), models.num_states)
+    if not with_moments:
+        chosen, owner = drawn_pairs(chosen, numbers.owner)
+        numbers = dataclasses.replace(numbers, owner=owner)
     diffuse = torch.full((len(chosen.row),), diffuse_m, dtype=torch.float64)
     filtered = filter_forward(models[chosen.model], nodes[chosen.row], diffuse)
     backward = backward_kernel(filtered)
@@ -264,8 +270,6 @@ def _smooth_rows(
         each_mean = node_mean[..., :2].gather(1, pick[..., None].expand(-1, -1, 2))
         each_variance = (0.5 * (node_covariance[..., 0, 0] + node_covariance[..., 1, 1])).gather(1, pick)
         mean, variance = mixture_moments(each_mean, each_variance, chosen)
-    num_nodes = nodes.time_s.shape[1]
-    numbers = random_numbers(chosen.weight, rows, seeds, num_hypotheses, num_nodes, len(time_s), filtered.mean.shape[-1])
     pair = chosen.first_pair[:, None] + numbers.owner
     state = draw(backward, pair.flatten(), numbers.normal.flatten(0, 1)).view(len(mean), num_hypotheses, num_nodes, -1)
     sample = state[..., :2].gather(2, step_index[:, None, :, None].expand(-1, num_hypotheses, -1, 2))

@@ -50,6 +50,23 @@ def choose_models(log_posterior: Tensor) -> Chosen:
     return Chosen(weight, row, model[is_used], weight[is_used], torch.searchsorted(row, torch.arange(len(weight))))
 
 
+def drawn_pairs(chosen: Chosen, owner: Tensor) -> tuple[Chosen, Tensor]:
+    """The pairs that draw any hypothesis, and which of its row's pairs [R, K] draws each: the others need no filter.
+
+    Args:
+        chosen: the models of every row.
+        owner: [R, K] which of the row's chosen models draws the hypothesis.
+    """
+    pair = chosen.first_pair[:, None] + owner
+    is_drawn = torch.zeros(len(chosen.row), dtype=torch.bool)
+    is_drawn[pair.flatten()] = True
+    row = chosen.row[is_drawn]
+    first_pair = torch.searchsorted(row, torch.arange(len(owner)))
+    number = is_drawn.cumsum(0) - 1
+    kept = Chosen(chosen.weight, row, chosen.model[is_drawn], chosen.pair_weight[is_drawn], first_pair)
+    return kept, number[pair] - first_pair[:, None]
+
+
 def at_node(filtered: Filtered, chosen: Chosen, index: Tensor, node: Tensor, num_models: int) -> tuple[Tensor, Tensor, Tensor]:
     """Filtered moments at one node a row, and weights, spread out over C models [R, C, ...]."""
     num_rows = len(node)
