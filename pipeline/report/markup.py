@@ -1,10 +1,14 @@
 """The few pieces of HTML that the sections are made of. Every text goes through `escape`: logs choose their own names."""
 
+import base64
 import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from typing import Any
+
+import numpy as np
+import numpy.typing as npt
 
 MAX_VALUE_CHARACTERS = 400
 
@@ -106,6 +110,11 @@ def _toml_key(key: str) -> str:
 
 def _toml_string(value: str) -> str:
     return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+
+
+def numbers_as_base64(values: npt.ArrayLike, kind: str) -> str:
+    """Numbers one behind the other as `kind` (such as "<i2"): what the page's script reads as a typed array."""
+    return base64.b64encode(np.ascontiguousarray(np.asarray(values).astype(kind)).tobytes()).decode("ascii")
 
 
 def inline_json(value: object) -> str:

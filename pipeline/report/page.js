@@ -10,6 +10,7 @@
   const f8 = (text) => new Float64Array(bytes(text));
   const f4 = (text) => new Float32Array(bytes(text));
   const i2 = (text) => new Int16Array(bytes(text));
+  const i4 = (text) => new Int32Array(bytes(text));
   const readPoints = (code) => code && { time: f8(code.time_s), owner: i2(code.owner), position: f4(code.position_m) };
   const detections = readPoints(data.detections), truth = readPoints(data.truth), poses = readPoints(data.poses);
 
@@ -584,4 +585,5 @@
   width = canvas.clientWidth || 1; height = canvas.clientHeight || 1;
   setWindow(data.first_window);
   fitAll();
+  if (byId("moving")) playWhole({ byId, f8, i4, i2, clock, colours });
 })();

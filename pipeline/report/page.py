@@ -69,7 +69,7 @@ $sections</main>
 
 def write_page(mission: Mission, analysis: Analysis, payload: Payload, moments: Sequence[Moment], whole: str = "") -> str:
     """The page as text; `whole` is the section with the map of the whole mission."""
-    script = _asset("page.js")
+    script = _asset("moving.js") + _asset("page.js")
     # Only our own script may run and nothing may be fetched, whatever a log manages to put into the page.
     digest = base64.b64encode(hashlib.sha256(script.encode("utf-8")).digest()).decode("ascii")
     policy = f"default-src 'none'; style-src 'unsafe-inline'; script-src 'sha256-{digest}'; base-uri 'none'; form-action 'none'"

@@ -3,19 +3,18 @@
 Everything that is shown less finely than it was computed is named in `Payload.notes`.
 """
 
-import base64
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from cadence.arrays import Float64s
 from pipeline.arrays import Column
 from pipeline.report.fans import FanCode
 from pipeline.report.geodesy import GeodesyFit
+from pipeline.report.markup import numbers_as_base64
 from pipeline.report.mission import LIKELY, Mission, Points, WindowRow
 from pipeline.report.modes import DIRECTIONS
 
@@ -146,9 +145,9 @@ def _encode_points(mission: Mission, points: Points | None, origin_m: Float64s) 
     if points is None:
         return None
     return {
-        "time_s": _base64((points.time_ns - mission.start_ns) / 1e9, "<f8"),
-        "owner": _base64(points.owner, "<i2"),
-        "position_m": _base64(points.position_m - origin_m, "<f4"),
+        "time_s": numbers_as_base64((points.time_ns - mission.start_ns) / 1e9, "<f8"),
+        "owner": numbers_as_base64(points.owner, "<i2"),
+        "position_m": numbers_as_base64(points.position_m - origin_m, "<f4"),
     }
 
 
@@ -156,24 +155,20 @@ def _encode_fans(codes: Sequence[FanCode], windows: Sequence[int], agents: Seque
     window_place = {window: index for index, window in enumerate(windows)}
     agent_place = {agent: index for index, agent in enumerate(agents)}
     return {
-        "window": _base64([window_place[code.window] for code in codes], "<i2"),
-        "agent": _base64([agent_place[code.agent] for code in codes], "<i2"),
-        "num_hypotheses": _base64([len(code.weight) for code in codes], "<i2"),
-        "num_vertices": _base64([len(code.step) for code in codes], "<i2"),
-        "centre_m": _base64([code.centre_m - origin_m for code in codes], "<f4"),
-        "scale_m": _base64([code.scale_m for code in codes], "<f4"),
+        "window": numbers_as_base64([window_place[code.window] for code in codes], "<i2"),
+        "agent": numbers_as_base64([agent_place[code.agent] for code in codes], "<i2"),
+        "num_hypotheses": numbers_as_base64([len(code.weight) for code in codes], "<i2"),
+        "num_vertices": numbers_as_base64([len(code.step) for code in codes], "<i2"),
+        "centre_m": numbers_as_base64([code.centre_m - origin_m for code in codes], "<f4"),
+        "scale_m": numbers_as_base64([code.scale_m for code in codes], "<f4"),
         "step": _joined([code.step for code in codes], "<i2"),
         "weight": _joined([code.weight for code in codes], "<f4"),
         "hypothesis": _joined([code.hypothesis for code in codes], "<i2"),
-        "num_strands": _base64([len(code.strand) for code in codes], "<i2"),
+        "num_strands": numbers_as_base64([len(code.strand) for code in codes], "<i2"),
         "strand": _joined([code.strand for code in codes], "<i2"),
         "summary": _joined([code.summary for code in codes], "<i2"),
     }
 
 
-def _base64(values: npt.ArrayLike, kind: str) -> str:
-    return base64.b64encode(np.ascontiguousarray(np.asarray(values).astype(kind)).tobytes()).decode("ascii")
-
-
 def _joined(arrays: Sequence[Column], kind: str) -> str:
-    return _base64(np.concatenate([np.empty(0), *(array.ravel() for array in arrays)]), kind)
+    return numbers_as_base64(np.concatenate([np.empty(0), *(array.ravel() for array in arrays)]), kind)

@@ -28,4 +28,4 @@ def report(directory: Path, config: ReportConfig, progress: Progress, force: boo
 def _assets() -> list[Path]:
     # The look of the page is an input too: a newer style must not be skipped.
     folder = Path(str(resources.files("pipeline.report")))
-    return [folder / "page.css", folder / "page.js", folder / "explorer.html"]
+    return [folder / "page.css", folder / "page.js", folder / "moving.js", folder / "explorer.html"]

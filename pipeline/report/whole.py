@@ -9,6 +9,7 @@ from cadence.arrays import Float64s
 from pipeline.report.maps import View, draw_line, draw_obstacle, north_arrow, scale_bar, simplify
 from pipeline.report.markup import legend, section
 from pipeline.report.mission import Mission
+from pipeline.report.moving import moving_parts
 from pipeline.stories import MissionStories
 
 _WIDTH, _HEIGHT = 800, 460
@@ -36,7 +37,9 @@ def whole_section(mission: Mission, max_bytes: float) -> str:
     parts += [*_names(mission, view), scale_bar(view.pixel_per_m, _HEIGHT), north_arrow(_WIDTH)]
     lead = _words(mission, num_stories)
     opening = f'<svg class="map whole" viewBox="0 0 {_WIDTH} {_HEIGHT}" role="img" aria-label="{escape(lead)}">'
-    return section("The whole mission", f"{opening}{''.join(parts)}</svg>{legend(_keys(mission))}", lead)
+    drawn = f'<div class="moving">{opening}{"".join(parts)}</svg><canvas id="whole-map" class="only-script"></canvas></div>'
+    moving = moving_parts(mission.stories, num_stories, view, (_WIDTH, _HEIGHT), mission.start_ns, max_bytes)
+    return section("The whole mission", f"{drawn}{moving}{legend(_keys(mission))}", lead)
 
 
 def _words(mission: Mission, num_stories: int) -> str:

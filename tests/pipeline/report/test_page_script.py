@@ -9,6 +9,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pytest
 from fixtures import mission as fixture
+from fixtures.asked import asked_mission
 from fixtures.browser import Browser, NoBrowser, Page, chromium
 from fixtures.mission import GEOREFERENCED, build_mission, make_uncertain, rename_agents
 
@@ -414,3 +415,38 @@ def test_a_mission_without_hypotheses_has_a_map_of_its_detections(open_page: Ope
     with_detections = picture(page)
     page.click("[data-layer=everywhere]")
     assert picture(page) != with_detections
+
+
+BALLS = """(() => {
+  const map = document.getElementById("whole-map"), { data } = map.getContext("2d").getImageData(0, 0, map.width, map.height);
+  let [count, x, y] = [0, 0, 0];
+  for (let i = 0; i < map.width * map.height; i++) {
+    if (data[4 * i + 3] > 200) { count++; x += i % map.width; y += Math.floor(i / map.width); }
+  }
+  return [count, x / count / map.width, y / count / map.height];
+})()"""
+
+
+def test_mission_hypotheses_move_over_the_whole_map(open_page: Open, tmp_path: Path) -> None:
+    directory = asked_mission(tmp_path)
+    report(directory, ReportConfig(), Progress(quiet=True))
+    page = open_page(directory / "report.html")
+    still = page.ask("document.querySelector('svg.whole').outerHTML")
+    begin = "s = document.getElementById('whole-time'); s.value = {}; s.dispatchEvent(new Event('input'))"
+    seen = {}
+    for at in (0, 250, 500):
+        page.ask(begin.format(at))
+        seen[at] = page.ask(BALLS)
+        assert text(page, "#whole-moment") == f"2023-11-14 22:{13 + (20 + at // 5) // 60}:{(20 + at // 5) % 60:02} UTC"
+    # T0 comes from the west and T1 from the south; after half of the time both are in the middle, as one ball.
+    assert seen[500][1:] == pytest.approx([0.5, 0.5], abs=0.03) and 20 < seen[500][0] < 0.7 * seen[250][0]
+    assert seen[0][1] < 0.45 and seen[0][2] > 0.55 and seen[0][1] < seen[250][1] < seen[500][1]
+    paces = page.ask("[...document.getElementById('whole-pace').options].map(option => Number(option.value))")
+    assert paces == [1, 10, 60, 300, 600]
+    page.ask(begin.format(0))
+    page.ask("p = document.getElementById('whole-pace'); p.value = 60; p.dispatchEvent(new Event('change'))")
+    page.click("#whole-play")
+    page.wait("Number(document.getElementById('whole-time').value) > 100")
+    page.click("#whole-play")
+    assert text(page, "#whole-play") == "Play" and page.ask(BALLS)[1] > seen[0][1]
+    assert page.ask("document.querySelector('svg.whole').outerHTML") == still, "lines, obstacles and detections stay"
