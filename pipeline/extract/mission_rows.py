@@ -10,6 +10,7 @@ import numpy as np
 
 from cadence.errors import InputError, NothingDetectedError
 from pipeline.counted import counted
+from pipeline.extract.bearing_check import without_contradicted
 from pipeline.extract.cameras import read_cameras
 from pipeline.extract.channel_reader import ChannelReader
 from pipeline.extract.config import ExtractConfig
@@ -22,9 +23,9 @@ from pipeline.extract.names import Naming, without_false_names
 from pipeline.extract.observers import from_observer
 from pipeline.extract.placement import Placing, bring_together, datum_of_transforms, in_enu, mission_frame, place
 from pipeline.extract.positions import Positions, Rows
-from pipeline.extract.reuse import without_reused_names
+from pipeline.extract.reuse import reused, without_reused_names
 from pipeline.extract.selection import ROLES
-from pipeline.extract.sightings import SIGHTINGS, in_pairs, read_parts, together
+from pipeline.extract.sightings import SIGHTINGS, Sightings, in_pairs, read_parts, together, without_names
 from pipeline.extract.spikes import is_spike
 from pipeline.extract.stages import without_other_stages
 from pipeline.extract.stretches import without_set_back, without_unjoined
@@ -85,7 +86,12 @@ def rows_in_frame(
     datum = config.datum or datum_of_transforms(rows[primary], read_tree)
     frame = mission_frame(rows[primary], [rows[role] for role in ROLES if role != primary], datum)
     rows = {role: _placed(role, found, frame, counts, transforms.apart) for role, found in rows.items()}
+    before = set(rows["detections"].agents.names)
     rows["detections"] = _identified(rows["detections"], readers, config.simultaneity_s, suspicions)
+    if isinstance(found := rows.get(SIGHTINGS), Sightings):
+        lost = before - set(rows["detections"].agents.names)
+        found = without_names(found, lost | reused(rows["detections"].agents.names))
+        rows[SIGHTINGS] = without_contradicted(found, rows["detections"], suspicions)
     rows |= {role: _without_spikes(rows[role], config.max_speed_mps, counts) for role in ROLES}
     if config.thinning.enabled:
         rows["detections"] = _thinned(rows[primary], config.thinning)

@@ -68,6 +68,11 @@ def without_reused_names(rows: Positions, tolerance_s: float, naming: Naming, su
     return rows.changed(agent=agent) if any(told.any() for told in found.values()) else rows
 
 
+def reused(names: Collection[str]) -> set[str]:
+    """Which names became several, by what they are called now."""
+    return {name.removesuffix(mark) for name in names for mark in (".2", ".reused.2") if name.endswith(mark)} & set(names)
+
+
 def _track(rows: Positions) -> Track:
     time_s = (rows.time_ns - rows.time_ns[0]).astype(np.float64) * 1e-9
     return Track(time_s, rows.first + 1j * rows.second, np.nan_to_num(rows.covariance_m2[:, [0, 2]].max(axis=1)))

@@ -129,6 +129,13 @@ def together(parts: Sequence[Positions]) -> Sightings:
     return both[np.argsort(both.time_ns, kind="stable")]
 
 
+def without_names(rows: Sightings, names: Collection[str]) -> Sightings:
+    """The sightings; those of names of which detections turned out not to mean one agent are about nobody knows whom."""
+    if not names:
+        return rows
+    return rows.changed(agent=np.array([None if name in names else name for name in rows.agent], dtype=object))
+
+
 def measurement_rows(placed: Sightings, poses: Positions, height_topics: Collection[str]) -> MeasurementRows:
     """Paired sightings in the mission frame as measurements [M]; those of which an end was lost on the way are left out.
 

@@ -43,7 +43,7 @@ def floats(column: np.ndarray) -> np.ndarray:
 
 def test_compass_bearings_from_a_place(tmp_path: Path) -> None:
     rows = [*detected(), *(heard(float(i), bearing=np.radians(30.0 * i)) for i in range(8))]
-    found = run(tmp_path, rows, detections=[DETECTED, FINDER])
+    found = run(tmp_path, rows, detections=[DETECTED, FINDER], trusted=["place"])
     seen_as = measured(found)
     assert floats(seen_as["observer_x_m"]).tolist() == [100.0] * 8 and floats(seen_as["observer_y_m"]).tolist() == [-50.0] * 8
     # from east towards north
@@ -72,7 +72,13 @@ def test_from_a_boat_that_moves(tmp_path: Path) -> None:
     contacts = [fix(3.0 * i, 50.1, -1.0, "/contacts/fox") for i in range(4)]
     source = {key: value for key, value in FINDER.items() if not key.startswith("observer")} | {"observer": "boat"}
     rows = [*boat, *contacts, *(heard(float(i), bearing=0.5) for i in range(12))]
-    found = run(tmp_path, rows, detections=[{"topic": "/contacts/{agent}"}, source], poses=[{"topic": "/{sensor}/fix"}])
+    found = run(
+        tmp_path,
+        rows,
+        detections=[{"topic": "/contacts/{agent}"}, source],
+        poses=[{"topic": "/{sensor}/fix"}],
+        trusted=["place"],
+    )
     seen_as = measured(found)
     np.testing.assert_allclose(np.diff(floats(seen_as["observer_y_m"])), 55.6, atol=0.1)
     np.testing.assert_allclose(floats(seen_as["observer_vy_mps"]), 55.6, atol=0.1)
@@ -134,7 +140,7 @@ def test_a_beam_too_wide_is_no_position_where_others_are(tmp_path: Path) -> None
 
 def test_read_back_for_the_windows(tmp_path: Path) -> None:
     rows = [*detected(), *(heard(float(i), bearing=0.1 * i) for i in range(8))]
-    run(tmp_path, rows, detections=[DETECTED, FINDER])
+    run(tmp_path, rows, detections=[DETECTED, FINDER], trusted=["place"])
     found = read_measurements(tmp_path, START_NS - 10**9)
     assert found is not None and found.time_s.tolist() == [1.0 + i for i in range(8)] and found.agent_ids == ("fox",) * 8
     assert np.isnan(found.observer_height_m).all() and (found.observer_velocity_mps == 0).all()
@@ -180,3 +186,51 @@ def test_without_a_transform_near_in_time_it_is_left_out_and_counted_once(tmp_pa
     source = {"topic": "/finder", "bearing": "bearing", "bearing_sigma_deg": 1.0}
     found = run(tmp_path, rows, detections=[DETECTED, source])
     assert found.summary["measurements"]["num"] == 2 and found.summary["transforms"]["no_transform"] == 2
+
+
+def moving(num: int = 30) -> list[Row]:
+    """A target that goes from west to east past the finder at (100, -50), a detection a second."""
+    return [detection(float(i), -600.0 + 40.0 * i, 900.0, agent_id="fox") for i in range(num)]
+
+
+def towards(i: float) -> float:
+    """Clockwise from north, the bearing of the target from the finder."""
+    return float(np.arctan2(-600.0 + 40.0 * i - 100.0, 950.0))
+
+
+@pytest.mark.parametrize(
+    ("wrong", "hint"),
+    [
+        (lambda bearing: np.pi / 2 - bearing, "; from north clockwise, or from east and not, they would fit"),
+        (
+            lambda bearing: bearing + 0.6,
+            "; all turned by -34.4 degrees they would fit|; all turned by 34.4 degrees they would fit",
+        ),
+        (lambda bearing: 3.0 * bearing + 1.0, ""),
+    ],
+)
+def test_bearings_that_point_elsewhere_are_told_and_left_out(tmp_path: Path, wrong: Any, hint: str) -> None:
+    rows = [*moving(), *(heard(i + 0.5, bearing=wrong(towards(i + 0.5))) for i in range(28))]
+    found = run(tmp_path, rows, detections=[DETECTED, FINDER])
+    (suspicion,) = found.summary["suspicions"]
+    assert suspicion["subject"] == "/finder" and suspicion["done"] == "its bearings are left out"
+    assert any(suspicion["seen"].endswith(f"just before and after{each}") for each in hint.split("|"))
+    assert "measurements" not in found.summary
+    told = run(tmp_path, rows, detections=[DETECTED, FINDER], trusted=["place"])
+    assert told.summary["suspicions"] == [] and told.summary["measurements"]["num"] == 28
+
+
+def test_right_bearings_are_not_suspected(tmp_path: Path) -> None:
+    noise = np.random.default_rng(2).normal(0.0, np.radians(1.5), 28)
+    rows = [*moving(), *(heard(i + 0.5, bearing=towards(i + 0.5) + noise[i]) for i in range(28))]
+    found = run(tmp_path, rows, detections=[DETECTED, FINDER])
+    assert found.summary["suspicions"] == [] and found.summary["measurements"]["num"] == 28
+
+
+def test_names_that_several_bear_are_nobodys(tmp_path: Path) -> None:
+    """The name is given out anew 80 km away: whom a bearing is about nobody knows."""
+    far = [detection(60.0 + i, 80_000.0 + 40.0 * i, 900.0, agent_id="fox") for i in range(20)]
+    rows = [*moving(20), *far, *(heard(i + 0.5, bearing=towards(i + 0.5)) for i in range(18))]
+    found = run(tmp_path, rows, detections=[DETECTED, FINDER])
+    assert set(found.detections["agent_id"].to_pylist()) == {"fox", "fox.2"}
+    assert found.summary["measurements"]["agents"] == {} and found.summary["measurements"]["num"] == 18
