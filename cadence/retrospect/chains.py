@@ -1,10 +1,12 @@
-"""Which model of motion moves a target in each stretch of a mission: chains of models drawn given all detections.
+"""Which model of motion moves a target in each stretch of a mission: chains of models, proposed given all detections.
 
 A model is kept from one stretch to the next with the chance that the bank gives a track after its last detection, else drawn
-anew from the log's prior weights: a hidden Markov chain, whose evidence in a stretch is the likelihood of its detections
-given those shortly before it. Whole chains are drawn by forward filter and backward sampling (Scott, "Bayesian methods for
-hidden Markov models", JASA 97, 2002).
+anew from the log's prior weights: a hidden Markov chain. What is proposed rests on an estimate of its evidence in a stretch,
+the likelihood of its detections given those shortly before it under one model; what a chain really makes of them comes to
+count in `filtering`.
 """
+
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -17,6 +19,9 @@ from cadence.retrospect.timeline import Timeline
 
 _NUM_BEFORE = 3
 """Detections before a stretch that say how the target came into it."""
+_INFORMED = 0.5
+"""Share of what is proposed that rests on evidence. Where a gap began in an earlier stretch this is wrong by much: it takes one
+model for what led across the whole gap. What is proposed from the prior bounds the weights."""
 
 
 def stretch_evidence(bank: Bank, rows: Nodes, timeline: Timeline) -> Tensor:
@@ -67,36 +72,57 @@ def _cut(rows: Nodes, row: Tensor, begin: Tensor, end: Tensor) -> Nodes:
     return Nodes(rows.time_s[index], rows.position_m[index], rows.covariance_m2[index], is_observed)
 
 
-def drawn_chains(bank: Bank, evidence: Tensor, timeline: Timeline, uniform: Tensor) -> Tensor:
-    """Models [R, H, J] of H chains a row, drawn given the evidence of all stretches.
+@dataclass(frozen=True, eq=False)
+class Chains:
+    """The hidden Markov chain of one bank's models over the stretches of R rows.
 
-    Args:
-        bank: its weights, the rate at which models change, and how much the likelihood is believed (temper).
-        evidence: [R, J, C], see `stretch_evidence`.
-        timeline: J stretches.
-        uniform: [R, H, J] uniform numbers.
+    prior       [C] weights of the models
+    stay        [J - 1] chance that a model is kept from a stretch to the next
+    log_local   [R, J, C] estimated evidence of each stretch
+    log_ahead   [R, J, C] that of all later stretches, given the model in this one
     """
-    r, num_stretches, num_models = evidence.shape
-    prior = torch.full((num_models,), 1.0 / num_models).double() if bank.log_weight is None else bank.log_weight.exp()
-    stay = torch.exp(-bank.switch_rate / timeline.step_s * _apart_s(timeline))
-    likelihood = bank.temper * evidence
-    forward = torch.empty(r, num_stretches, num_models, dtype=torch.float64)
-    for j in range(num_stretches):
-        before = prior.expand(r, -1) if j == 0 else stay[j - 1] * forward[:, j - 1] + (1.0 - stay[j - 1]) * prior
-        forward[:, j] = torch.softmax(before.log() + likelihood[:, j], dim=1)
-    model = torch.empty(uniform.shape, dtype=torch.int64)
-    for j in range(num_stretches - 1, -1, -1):
-        weight = forward[:, j, None].expand(-1, uniform.shape[1], -1)
-        if j + 1 < num_stretches:
-            later = model[:, :, j + 1, None]
-            # what is not kept may also be drawn anew as the same model
-            kept = torch.zeros_like(weight).scatter_(2, later, stay[j].expand(later.shape))
-            weight = weight * (kept + (1.0 - stay[j]) * prior[later])
-        edges = weight.cumsum(2)
-        model[:, :, j] = torch.searchsorted(edges, uniform[:, :, j, None] * edges[..., -1:], right=True)[..., 0].clamp(
-            max=num_models - 1
-        )
-    return model
+
+    prior: Tensor
+    stay: Tensor
+    log_local: Tensor
+    log_ahead: Tensor
+
+    @staticmethod
+    def of(bank: Bank, local: Tensor, timeline: Timeline) -> "Chains":
+        """The chain of a bank by its weights and rate of change; `local` [R, J, C] is the evidence of stretches."""
+        num_models = local.shape[-1]
+        prior = torch.full((num_models,), 1.0 / num_models).double() if bank.log_weight is None else bank.log_weight.exp()
+        stay = torch.exp(-bank.switch_rate / timeline.step_s * _apart_s(timeline))
+        ahead = torch.zeros_like(local)
+        for j in range(local.shape[1] - 2, -1, -1):
+            later = local[:, j + 1] + ahead[:, j + 1]
+            top = later.amax(1, keepdim=True)
+            value = (later - top).exp()
+            anew = (value * prior).sum(1, keepdim=True)
+            ahead[:, j] = (stay[j] * value + (1.0 - stay[j]) * anew).log() + top
+        return Chains(prior, stay, local, ahead)
+
+    def passes(self, stretch: int, before: Tensor) -> Tensor:
+        """Chances [..., C] of the models in a stretch given those `before` it [...]."""
+        kept = torch.nn.functional.one_hot(before, len(self.prior)).double()
+        stay = self.stay[stretch - 1]
+        return stay * kept + (1.0 - stay) * self.prior
+
+    def proposed(self, stretch: int, before: Tensor | None, uniform: Tensor) -> tuple[Tensor, Tensor]:
+        """Models [R, H] of a stretch drawn given those before it [R, H] (None: it is the first), and log prior over proposal.
+
+        Args:
+            stretch: its number.
+            before: models in the stretch before.
+            uniform: [R, H] uniform numbers.
+        """
+        prior = self.prior.expand(*uniform.shape, -1) if before is None else self.passes(stretch, before)
+        score = prior.log() + (self.log_local[:, stretch] + self.log_ahead[:, stretch])[:, None]
+        chance = _INFORMED * torch.softmax(score, dim=-1) + (1.0 - _INFORMED) * prior
+        edges = chance.cumsum(-1)
+        model = torch.searchsorted(edges, uniform[..., None] * edges[..., -1:], right=True)[..., 0]
+        model = model.clamp(max=len(self.prior) - 1)[..., None]
+        return model[..., 0], (prior.gather(-1, model) / chance.gather(-1, model)).log()[..., 0]
 
 
 def _apart_s(timeline: Timeline) -> Tensor:

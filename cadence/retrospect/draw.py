@@ -1,15 +1,15 @@
-"""Whole tracks of a mission given all detections: forward filter over all stretches, then a joint draw backwards.
+"""Whole tracks of a mission given all detections: filters forwards over all stretches, then a joint draw backwards.
 
-Given which model moves the target in each stretch (`chains`), everything is linear and Gaussian, so that joint samples of the
-whole track are exact and cost is linear in its length: one filter along each chain, then for each hypothesis the state at every
-step given the state at the next one (Carter and Kohn, "On Gibbs sampling for state space models", Biometrika 81, 1994).
-Position and velocity are the same on both sides of the border of two stretches, so that tracks are unbroken. Of the forward
-pass only the moments at the borders are kept, and a stretch is filtered again when its turn comes: memory does not grow with
-the filter's length.
+Given which model moves the target in each stretch, everything is linear and Gaussian: for each hypothesis the state at every
+step is drawn given the state at the next one, and at the border of two stretches the particle of `filtering`, and with it the
+model, of the earlier one given the state and the model with which the later one begins (backward simulation: Godsill, Doucet,
+West, "Monte Carlo smoothing for nonlinear time series", JASA 99, 2004; for models that change, Lindsten and Schoen, "Backward
+simulation methods for Monte Carlo statistical inference", Foundations and Trends in Machine Learning 6, 2013, ch. 4).
+Position and velocity are the same on both sides of a border, so that tracks are unbroken; cost is linear in the length.
 """
 
 import dataclasses
-import functools
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -17,48 +17,25 @@ import torch
 from torch import Tensor
 
 from cadence.bank.bank import Bank
-from cadence.bank.components import MotionModels
-from cadence.bank.fitting import DIFFUSE_STEPS, FLOOR_STEPS, with_floor
 from cadence.bank.mixture import merge_grid
 from cadence.bank.pool import BankPool, shared_out
-from cadence.bank.smoother import Backward, Nodes, backward_kernel, diffuse_start, filter_from
-from cadence.retrospect.chains import drawn_chains, stretch_evidence
+from cadence.bank.smoother import Backward, backward_kernel, filter_from
+from cadence.retrospect.filtering import Filtered, Plan, Tracks
 from cadence.retrospect.timeline import Timeline
 from cadence.seeds import derived_seeds
 
-NUM_CHAINS = 60
-"""Chains of models a track: so many filters run; hypotheses share them."""
+NUM_PARTICLES = 60
+"""Chains of models that are followed at once for each track: so many filters run."""
+_LEAST_PARTICLES = 4
+"""Of a member of the pool that draws any hypothesis."""
+_BELIEVED = 0.3
+"""A pool's likelihood counts to this power at most where chains are weighed: no model of the bank is how a target moves, and of
+a whole mission the one that is least wrong would be thought certain."""
 _TRIES = 6
 """So often a stretch is drawn until it keeps the limits; what hardly ever does is mended instead."""
 
 Keeps = Callable[[Tensor, Tensor, Tensor], Tensor]
 """(positions [N, L, 2], steps that are asked for [N, L], their times [L]) -> which of them keep the limits [N]."""
-
-
-@dataclass(frozen=True, eq=False)
-class Tracks:
-    """R tracks to be drawn.
-
-    rows     detections [R, N] by time, padding last; one at least each
-    begin_s  [R] from when on the track is asked for
-    end_s    [R] up to when
-    seeds    [R] of all random numbers of the track
-    """
-
-    rows: Nodes
-    begin_s: Tensor
-    end_s: Tensor
-    seeds: Tensor
-
-    def __getitem__(self, index: Tensor) -> "Tracks":
-        """A selection of the tracks, no wider than it must be."""
-        rows = self.rows[index]
-        num = max(1, int(rows.is_observed.sum(1).max()))
-        rows = Nodes(*(value[:, :num] for value in (rows.time_s, rows.position_m, rows.covariance_m2, rows.is_observed)))
-        return Tracks(rows, self.begin_s[index], self.end_s[index], self.seeds[index])
-
-    def __len__(self) -> int:
-        return len(self.begin_s)
 
 
 def draw_tracks(
@@ -69,164 +46,153 @@ def draw_tracks(
     A track depends on its own detections and seed alone. Stretches that do not keep limits (`keeps`) are drawn anew a few
     times; what does not help is left for `limits` to mend.
     """
-    members, weight = (pool.members, pool.weight_past) if isinstance(pool, BankPool) else ((pool,), torch.ones(1).double())
-    member = shared_out(weight, min(NUM_CHAINS, num_hypotheses))
-    return draw_by_members(members, member, tracks, timeline, torch.arange(num_hypotheses) % len(member), keeps)
+    members, weight = _believed(pool) if isinstance(pool, BankPool) else ((pool,), torch.ones(1).double())
+    drawing = shared_out(weight, num_hypotheses)
+    used = torch.unique(drawing)
+    count = (NUM_PARTICLES * weight[used]).round().long().clamp_min(_LEAST_PARTICLES)
+    return draw_by_members(members, used.repeat_interleave(count), tracks, timeline, drawing, keeps)
+
+
+def _believed(pool: BankPool) -> tuple[tuple[Bank, ...], Tensor]:
+    """The members of a pool, none believing the likelihood more than it should, and their weights."""
+    members = (dataclasses.replace(member, temper=min(member.temper, _BELIEVED)) for member in pool.members)
+    return tuple(members), pool.weight_past
 
 
 def draw_by_members(
-    members: Sequence[Bank], member: Tensor, tracks: Tracks, timeline: Timeline, chain: Tensor, keeps: Keeps | None = None
+    members: Sequence[Bank], member: Tensor, tracks: Tracks, timeline: Timeline, drawing: Tensor, keeps: Keeps | None = None
 ) -> Tensor:
-    """As `draw_tracks`: `member` [H] says which of the members draws each chain, `chain` [K] which chain a hypothesis has."""
+    """As `draw_tracks`: `member` [H] is that of each particle, `drawing` [K] the one that draws each hypothesis."""
     begin_s, end_s = timeline.step_before(tracks.begin_s), timeline.step_after(tracks.end_s)
-    plan = _Plan.of(members, member, dataclasses.replace(tracks, begin_s=begin_s, end_s=end_s), timeline)
-    return _drawn_backwards(plan, plan.borders(), chain, keeps)
+    plan = Plan.of(members, member, dataclasses.replace(tracks, begin_s=begin_s, end_s=end_s), timeline)
+    return _drawn_backwards(plan, plan.filtered(), drawing, keeps)
 
 
-@dataclass(frozen=True, eq=False)
-class _Plan:
-    """P pairs of a track and a chain, row by row, and what is filtered along them.
-
-    models   of the bank in seconds and metres; model [P, J] that each chain has in each stretch
-    nodes    detections of each pair [P, N], as exact as its member of the pool takes them for
-    row      [P] the track; first, last [P] stretches between which it is drawn
-    """
-
-    models: MotionModels
-    model: Tensor
-    nodes: Nodes
-    row: Tensor
-    first: Tensor
-    last: Tensor
-    tracks: Tracks
-    timeline: Timeline
-    diffuse_m: float
-
-    @staticmethod
-    def of(members: Sequence[Bank], member: Tensor, tracks: Tracks, timeline: Timeline) -> "_Plan":
-        num_rows, num_chains, bank = len(tracks), len(member), members[0]
-        length_m = bank.length_m(timeline.step_s)
-        model = torch.empty(num_rows, num_chains, timeline.num_stretches, dtype=torch.int64)
-        uniform = _chain_numbers(tracks.seeds, num_chains, timeline.num_stretches)
-        extra_m = torch.zeros(num_chains, dtype=torch.float64)
-        evidence: dict[float, Tensor] = {}
-        for index in sorted(set(member.tolist())):
-            each, own = members[index], member == index
-            if each.noise_steps not in evidence:
-                evidence[each.noise_steps] = stretch_evidence(
-                    each, with_floor(tracks.rows, each.noise_steps * length_m), timeline
-                )
-            model[:, own] = drawn_chains(each, evidence[each.noise_steps], timeline, uniform[:, own])
-            extra_m[own] = (each.noise_steps**2 + FLOOR_STEPS**2) ** 0.5 * length_m
-        row = torch.arange(num_rows).repeat_interleave(num_chains)
-        rows = tracks.rows[row]
-        floor = extra_m.repeat(num_rows)[:, None, None, None] ** 2 * torch.eye(2, dtype=torch.float64)
-        nodes = dataclasses.replace(rows, covariance_m2=rows.covariance_m2 + floor)
-        first, last = timeline.stretch_of(tracks.begin_s)[row], timeline.stretch_of(tracks.end_s)[row]
-        models = bank.models.scaled(timeline.step_s, length_m / timeline.step_s)
-        return _Plan(models, model.flatten(0, 1), nodes, row, first, last, tracks, timeline, DIFFUSE_STEPS * length_m)
-
-    @property
-    def num_chains(self) -> int:
-        """Chains a track."""
-        return len(self.row) // len(self.tracks)
-
-    @property
-    def is_asked(self) -> Tensor:
-        """Steps [R, T] at which each track is asked for."""
-        time_s, tracks = self.timeline.time_s, self.tracks
-        return (time_s >= tracks.begin_s[:, None]) & (time_s <= tracks.end_s[:, None])
-
-    @functools.cached_property
-    def _stretch_of(self) -> Tensor:
-        """The stretch of every detection [R, N]; padding lies behind the last one."""
-        own = self.tracks.rows
-        return torch.where(own.is_observed, self.timeline.stretch_of(own.time_s), self.timeline.num_stretches)
-
-    def detections(self, stretch: int) -> Nodes:
-        """Detections [P, N'] of a stretch, padded behind; at least one column."""
-        number = self._stretch_of
-        begin, end = (torch.searchsorted(number, torch.full((len(number), 1), at))[:, 0] for at in (stretch, stretch + 1))
-        place = begin[:, None] + torch.arange(max(1, int((end - begin).max())))
-        is_observed = place < end[:, None]
-        pair = torch.arange(len(self.row))[:, None], place.clamp(max=number.shape[1] - 1)[self.row]
-        nodes = self.nodes
-        return Nodes(nodes.time_s[pair], nodes.position_m[pair], nodes.covariance_m2[pair], is_observed[self.row])
-
-    def start(self, stretch: int, before: tuple[Tensor, Tensor] | None) -> tuple[Tensor, Tensor]:
-        """Moments at the beginning of a stretch: where it begins a track diffuse ones, else those `before` its border."""
-        models = self.models[self.model[:, stretch]]
-        sigma_m = torch.full((len(self.row),), self.diffuse_m, dtype=torch.float64)
-        mean, covariance = diffuse_start(models, self.nodes.position_m[:, 0], sigma_m)  # about the track's first detection
-        if before is None:
-            return mean, covariance
-        has_begun = self.first < stretch
-        entered = _entered(models, self.model[:, stretch] == self.model[:, stretch - 1], *before)
-        return (
-            torch.where(has_begun[:, None], entered[0], mean),
-            torch.where(has_begun[:, None, None], entered[1], covariance),
-        )
-
-    @property
-    def stretches(self) -> range:
-        """Those in which any track is drawn."""
-        return range(int(self.first.min()), int(self.last.max()) + 1)
-
-    def borders(self) -> dict[int, tuple[Tensor, Tensor]]:
-        """Moments of every pair at the beginning of each stretch."""
-        found: dict[int, tuple[Tensor, Tensor]] = {}
-        before = None
-        for stretch in self.stretches:
-            found[stretch] = self.start(stretch, before)
-            if stretch + 1 in self.stretches:
-                ends = torch.stack([self.timeline.begin_s[stretch], self.timeline.begin_s[stretch + 1]])
-                nodes, _ = merge_grid(self.detections(stretch), ends)
-                filtered = filter_from(self.models[self.model[:, stretch]], nodes, *found[stretch])
-                before = filtered.mean[:, -1], filtered.covariance[:, -1]
-        return found
-
-
-def _entered(models: MotionModels, is_kept: Tensor, mean: Tensor, covariance: Tensor) -> tuple[Tensor, Tensor]:
-    """Moments [P, S(, S)] after models took over at a border: a target that begins to stay about a place does so here."""
-    size = models.num_states
-    if size == 4:
-        return mean, covariance
-    home = models.has_home.double()
-    matrix = torch.zeros(len(mean), size, size, dtype=torch.float64)
-    matrix[:, range(4), range(4)] = 1.0
-    noise = torch.zeros_like(matrix)
-    for axis in (0, 1):
-        matrix[:, axis + 4, axis] = home
-        noise[:, axis + 4, axis + 4] = torch.where(models.has_home, models.home_range, 0.0) ** 2
-    new_mean = (matrix @ mean[..., None])[..., 0]
-    new_covariance = matrix @ covariance @ matrix.mT + noise
-    return torch.where(is_kept[:, None], mean, new_mean), torch.where(is_kept[:, None, None], covariance, new_covariance)
-
-
-def _drawn_backwards(plan: _Plan, borders: Mapping[int, tuple[Tensor, Tensor]], chain: Tensor, keeps: Keeps | None) -> Tensor:
-    """Positions [R, K, T, 2] drawn from the last stretch to the first; `chain` [K] of each hypothesis."""
-    timeline, num_rows, num_hypotheses = plan.timeline, len(plan.tracks), len(chain)
+def _drawn_backwards(plan: Plan, found: Mapping[int, Filtered], drawing: Tensor, keeps: Keeps | None) -> Tensor:
+    """Positions [R, K, T, 2] drawn from the last stretch to the first."""
+    timeline, num_rows, num_hypotheses = plan.timeline, len(plan.tracks), len(drawing)
     out = torch.full((num_rows, num_hypotheses, len(timeline.time_s), 2), torch.nan, dtype=torch.float64)
-    pair = (torch.arange(num_rows)[:, None] * plan.num_chains + chain).flatten()
-    later: Tensor | None = None
+    later: _Later | None = None
     for number in reversed(plan.stretches):
-        stretch = _Stretch.of(plan, number, borders[number])
-        way_m, later = _drawn_stretch(stretch, pair, later, num_hypotheses, keeps)
+        pair = _chosen(plan, number, found[number], drawing, later)
+        stretch = _Stretch.of(plan, number, found[number], pair)
+        way_m, state = _drawn_stretch(stretch, later, num_hypotheses, keeps)
+        later = _Later(state, found[number].model[pair])
         first, stop = timeline.steps(number)
         out[:, :, first:stop] = way_m[:, : stop - first].view(num_rows, num_hypotheses, stop - first, 2)
     out[~plan.is_asked[:, None].expand(out.shape[:3])] = torch.nan
     return out
 
 
+@dataclass(frozen=True, eq=False)
+class _Later:
+    """With which states [R K, S] and models [R K] the next stretch begins."""
+
+    state: Tensor
+    model: Tensor
+
+
+def _chosen(plan: Plan, number: int, found: Filtered, drawing: Tensor, later: _Later | None) -> Tensor:
+    """The particle [R K] of each hypothesis in a stretch, drawn given what it does in the next one."""
+    num_rows, h, k = len(plan.tracks), plan.num_particles, len(drawing)
+    pair = torch.empty(num_rows, k, dtype=torch.int64)
+    uniform = _spread_uniform(plan, number, k)
+    is_last = (plan.last.view(num_rows, h)[:, 0] <= number)[:, None, None]
+    log_density = None if later is None else _Density.of(plan, found)
+    for index, chains in plan.chains.items():
+        own, drawn = (plan.member == index).nonzero()[:, 0], (drawing == index).nonzero()[:, 0]
+        if not len(drawn):
+            continue
+        score = found.log_weight.view(num_rows, h)[:, None, own].expand(-1, len(drawn), -1)
+        if later is not None and log_density is not None:
+            state, model = later.state.view(num_rows, k, -1)[:, drawn], later.model.view(num_rows, k)[:, drawn]
+            earlier = found.model.view(num_rows, h)[:, own]
+            passes = chains.passes(number + 1, earlier)[:, None].expand(-1, len(drawn), -1, -1)
+            passed = passes.gather(3, model[:, :, None, None].expand(-1, -1, len(own), 1))[..., 0].log()
+            density = plan.members[index].temper * log_density.at(own, state, model)
+            score = score + torch.where(is_last, 0.0, passed + density)
+        edges = torch.softmax(score, dim=-1).cumsum(-1)
+        at = torch.searchsorted(edges, uniform[:, drawn, None] * edges[..., -1:], right=True)[..., 0]
+        pair[:, drawn] = own[at.clamp(max=len(own) - 1)] + h * torch.arange(num_rows)[:, None]
+    return pair.flatten()
+
+
+def _spread_uniform(plan: Plan, number: int, num_hypotheses: int) -> Tensor:
+    """Uniform numbers [R, K], each row's own, evenly spread over hypotheses in random order."""
+    rows = []
+    for seed in derived_seeds(plan.tracks.seeds.numpy(), "choice", number).tolist():
+        generator = torch.Generator().manual_seed(seed)
+        order = torch.rand(num_hypotheses, generator=generator, dtype=torch.float64).argsort()
+        rows.append((order.double() + torch.rand(1, generator=generator, dtype=torch.float64)) / num_hypotheses)
+    return torch.stack(rows)
+
+
+@dataclass(frozen=True, eq=False)
+class _Density:
+    """How likely states are at the end of a stretch by each of its particles [R, H, ...], and at the beginning of the next.
+
+    model             [R, H] of the particles
+    mean, whiten      [R, H, 4] of position and velocity, and inverse Cholesky factors [R, H, 4, 4] of their covariance
+    log_scale         [R, H] log densities at the mean
+    centre            the same of the centre given these, with its gain [R, H, 2, 4] on them; None in a bank without homes
+    """
+
+    plan: Plan
+    model: Tensor
+    mean: Tensor
+    whiten: Tensor
+    log_scale: Tensor
+    centre: tuple[Tensor, Tensor, Tensor, Tensor] | None
+
+    @staticmethod
+    def of(plan: Plan, found: Filtered) -> "_Density":
+        shape = len(plan.tracks), plan.num_particles
+        mean, covariance = found.end
+        whiten, log_scale = _whitener(covariance[:, :4, :4])
+        centre = None
+        if mean.shape[-1] > 4:
+            at, gain, rest = _centre_law(mean, covariance)
+            of_centre, centre_scale = _whitener(rest)
+            centre = at.view(*shape, 2), gain.view(*shape, 2, 4), of_centre.view(*shape, 2, 2), centre_scale.view(shape)
+        state, whiten = mean[:, :4].view(*shape, 4), whiten.view(*shape, 4, 4)
+        return _Density(plan, found.model.view(shape), state, whiten, log_scale.view(shape), centre)
+
+    def at(self, own: Tensor, state: Tensor, model: Tensor) -> Tensor:
+        """Log densities [R, K', H'] of states [R, K', S], with which `model` [R, K'] begins, by the particles `own` [H']."""
+        away = state[:, :, None, :4] - self.mean[:, None, own]
+        found = self.log_scale[:, None, own] - 0.5 * ((self.whiten[:, None, own] @ away[..., None])[..., 0] ** 2).sum(-1)
+        if self.centre is None:
+            return found
+        at, gain, whiten, log_scale = (value[:, None, own] for value in self.centre)
+        off = state[:, :, None, 4:] - at - (gain @ away[..., None])[..., 0]
+        kept = log_scale - 0.5 * ((whiten @ off[..., None])[..., 0] ** 2).sum(-1)
+        range_m = self.plan.models.home_range[model]
+        begun = -((state[..., 4:] - state[..., :2]) ** 2).sum(-1) / (2.0 * range_m**2) - 2.0 * range_m.log()
+        begun = (begun - math.log(2.0 * math.pi))[:, :, None]
+        has_home = self.plan.models.has_home[model][:, :, None]
+        is_kept = self.model[:, None, own] == model[:, :, None]
+        return found + torch.where(has_home, torch.where(is_kept, kept, begun), 0.0)
+
+
+def _whitener(covariance: Tensor) -> tuple[Tensor, Tensor]:
+    """Inverse Cholesky factors [P, S, S] of covariances, and the logs of the densities [P] at their middle."""
+    scale = covariance.diagonal(dim1=-2, dim2=-1)
+    jitter = torch.diag_embed(1e-9 * (scale + 1e-6 * scale.amax(-1, keepdim=True)) + 1e-18)
+    root = torch.linalg.cholesky(covariance + jitter)
+    eye = torch.eye(covariance.shape[-1], dtype=torch.float64).expand_as(root)
+    log_scale = -root.diagonal(dim1=-2, dim2=-1).log().sum(-1) - 0.5 * covariance.shape[-1] * math.log(2.0 * math.pi)
+    return torch.linalg.solve_triangular(root, eye, upper=False), log_scale
+
+
 def _drawn_stretch(
-    stretch: "_Stretch", pair: Tensor, later: Tensor | None, num_hypotheses: int, keeps: Keeps | None
+    stretch: "_Stretch", later: _Later | None, num_hypotheses: int, keeps: Keeps | None
 ) -> tuple[Tensor, Tensor]:
     """Positions [R K, L, 2] at the steps of a stretch, and the states with which it begins.
 
     What does not keep the limits is drawn again, from where the next stretch begins, as often as helps a few times.
     """
-    every = torch.arange(len(pair))
-    way_m, state = stretch.draw(pair, later, stretch.numbers(num_hypotheses, 0))
+    every = torch.arange(len(stretch.pair))
+    way_m, state = stretch.draw(every, later, stretch.numbers(num_hypotheses, 0))
     if keeps is None:
         return way_m, state
     is_asked = stretch.is_asked
@@ -237,19 +203,23 @@ def _drawn_stretch(
         if not len(every) or attempt == _TRIES:
             break
         normal = stretch.numbers(num_hypotheses, attempt, sorted(set((every // num_hypotheses).tolist())))
-        way_m[every], state[every] = stretch.draw(pair[every], None if later is None else later[every], normal[every])
+        way_m[every], state[every] = stretch.draw(every, later, normal[every])
     return way_m, state
 
 
 @dataclass(frozen=True, eq=False)
 class _Stretch:
-    """One stretch, filtered for every pair, and how its states are drawn backwards.
+    """One stretch, filtered for each particle that a hypothesis has, and how its states are drawn backwards.
 
-    time_s is that of its steps [L], the beginning of the next one included, as it belongs to both.
+    particle is that of each hypothesis [R K], pair its number among those that are filtered; time_s that of the stretch's steps
+    [L], the beginning of the next one included, as it belongs to both.
     """
 
-    plan: _Plan
+    plan: Plan
     number: int
+    particle: Tensor
+    pair: Tensor
+    model: Tensor
     time_s: Tensor
     step_index: Tensor
     num_own: Tensor
@@ -257,15 +227,19 @@ class _Stretch:
     covariance: Tensor
 
     @staticmethod
-    def of(plan: _Plan, number: int, border: tuple[Tensor, Tensor]) -> "_Stretch":
+    def of(plan: Plan, number: int, found: Filtered, particle: Tensor) -> "_Stretch":
         first, stop = plan.timeline.steps(number)
         is_last = number + 1 == plan.timeline.num_stretches
         time_s = plan.timeline.time_s[first : stop + (not is_last)]
+        used, pair = torch.unique(particle, return_inverse=True)
         detections = plan.detections(number)
-        nodes, step_index = merge_grid(detections, time_s)
-        filtered = filter_from(plan.models[plan.model[:, number]], nodes, *border)
-        num_own = len(time_s) + detections.is_observed[:: plan.num_chains].sum(1)
-        return _Stretch(plan, number, time_s, step_index, num_own, backward_kernel(filtered), filtered.covariance[:, -1])
+        nodes, step_index = merge_grid(detections[used], time_s)
+        filtered = filter_from(plan.models[found.model[used]], nodes, found.begin[0][used], found.begin[1][used])
+        num_own = len(time_s) + detections.is_observed[:: plan.num_particles].sum(1)
+        return _Stretch(
+            plan, number, particle, pair, found.model[particle], time_s, step_index, num_own,
+            backward_kernel(filtered), filtered.covariance[:, -1],
+        )  # fmt: skip
 
     @property
     def is_asked(self) -> Tensor:
@@ -273,10 +247,10 @@ class _Stretch:
         first, _ = self.plan.timeline.steps(self.number)
         return self.plan.is_asked[:, first : first + len(self.time_s)]
 
-    def draw(self, pair: Tensor, later: Tensor | None, normal: Tensor) -> tuple[Tensor, Tensor]:
-        """Positions [N, L, 2] of N draws, and states [N, S] at the first step, given those with which the next one begins."""
-        backward = self.backward
-        state = self._end(pair, later, normal[:, -1])
+    def draw(self, which: Tensor, later: _Later | None, normal: Tensor) -> tuple[Tensor, Tensor]:
+        """Positions [N, L, 2] of the hypotheses `which` [N], and states [N, S] at the first step, given how the next begins."""
+        backward, pair = self.backward, self.pair[which]
+        state = self._end(which, later, normal[:, -1])
         states = [state]
         for m in range(backward.gain.shape[1] - 1, -1, -1):
             kick = (backward.root[:, m][pair] @ normal[:, m, :, None])[..., 0] + backward.offset[:, m][pair]
@@ -285,22 +259,22 @@ class _Stretch:
         way_m = torch.stack(states[::-1], 1)[..., :2]
         return way_m.gather(1, self.step_index[pair][..., None].expand(-1, -1, 2)), state
 
-    def _end(self, pair: Tensor, later: Tensor | None, normal: Tensor) -> Tensor:
+    def _end(self, which: Tensor, later: _Later | None, normal: Tensor) -> Tensor:
         """States [N, S] at the end: drawn where it is a track's last stretch, else what the next one begins with.
 
         Position and velocity are those with which the next stretch begins. The centre is as well where the model is kept; where
         another took over, it is drawn given position and velocity.
         """
-        mean, plan = self.backward.mean, self.plan
+        mean, plan, pair = self.backward.mean, self.plan, self.pair[which]
         fresh = mean[pair] + (self.backward.last_root[pair] @ normal[..., None])[..., 0]
-        if later is None or self.number + 1 == plan.timeline.num_stretches:
+        if later is None:
             return fresh
-        state = later.clone()
-        if later.shape[-1] > 4:
-            changed = (plan.model[:, self.number] != plan.model[:, self.number + 1])[pair].nonzero()[:, 0]
+        state = later.state[which].clone()
+        if state.shape[-1] > 4:
+            changed = (self.model[which] != later.model[which]).nonzero()[:, 0]
             if len(changed):
-                state[changed, 4:] = _centre(mean, self.covariance, pair[changed], later[changed, :4], normal[changed, 4:])
-        return torch.where((plan.last <= self.number)[pair, None], fresh, state)
+                state[changed, 4:] = _centre(mean, self.covariance, pair[changed], state[changed, :4], normal[changed, 4:])
+        return torch.where((plan.last[self.particle[which]] <= self.number)[:, None], fresh, state)
 
     def numbers(self, num_hypotheses: int, attempt: int, rows: Sequence[int] | None = None) -> Tensor:
         """Standard normal numbers [R K, M, S], of each row's own seed and for its own nodes; of `rows` only where given."""
@@ -320,23 +294,18 @@ class _Stretch:
 
 def _centre(mean: Tensor, covariance: Tensor, pair: Tensor, known: Tensor, normal: Tensor) -> Tensor:
     """Centres [N, 2] drawn given position and velocity [N, 4]; where a model has none, anything."""
-    scale = covariance[:, :4, :4].diagonal(dim1=-2, dim2=-1).amax(-1)[:, None, None]
-    known_m2 = covariance[:, :4, :4] + 1e-12 * scale * torch.eye(4, dtype=torch.float64)
-    gain = torch.linalg.solve(known_m2, covariance[:, :4, 4:]).mT
-    rest = covariance[:, 4:, 4:] - gain @ covariance[:, :4, 4:]
-    value, vector = torch.linalg.eigh(0.5 * (rest + rest.mT))
+    at, gain, rest = _centre_law(mean, covariance)
+    value, vector = torch.linalg.eigh(rest)
     root = vector * value.clamp_min(0.0).sqrt()[:, None]
-    at = mean[pair, 4:] + (gain[pair] @ (known - mean[pair, :4])[..., None])[..., 0]
+    at = at[pair] + (gain[pair] @ (known - mean[pair, :4])[..., None])[..., 0]
     drawn: Tensor = at + (root[pair] @ normal[..., None])[..., 0]
     return drawn
 
 
-def _chain_numbers(seeds: Tensor, num_chains: int, num_stretches: int) -> Tensor:
-    """Uniform numbers [R, H, J], of each stretch evenly spread over the chains."""
-    rows = []
-    for seed in seeds.tolist():
-        generator = torch.Generator().manual_seed(seed)
-        order = torch.rand(num_chains, num_stretches, generator=generator, dtype=torch.float64).argsort(0)
-        shift = torch.rand(1, num_stretches, generator=generator, dtype=torch.float64)
-        rows.append((order.double() + shift) / num_chains)
-    return torch.stack(rows)
+def _centre_law(mean: Tensor, covariance: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Mean [P, 2] of the centre, its gain [P, 2, 4] on what position and velocity are off theirs, and its covariance then."""
+    scale = covariance[:, :4, :4].diagonal(dim1=-2, dim2=-1).amax(-1)[:, None, None]
+    known_m2 = covariance[:, :4, :4] + 1e-12 * scale * torch.eye(4, dtype=torch.float64)
+    gain = torch.linalg.solve(known_m2, covariance[:, :4, 4:]).mT
+    rest = covariance[:, 4:, 4:] - gain @ covariance[:, :4, 4:]
+    return mean[:, 4:], gain, 0.5 * (rest + rest.mT)

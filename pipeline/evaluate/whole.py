@@ -63,18 +63,18 @@ def score_whole(
     """
     if case.is_matched:
         return None
-    chosen = _chosen(case, found, own)
+    chosen = told_once(case, found, own)
     if not chosen.any():
         return None
     windows = _selected(own, chosen)
     is_known = torch.zeros_like(case.is_known)
     is_known[windows.window, windows.agent, windows.step + case.scored.origin_index] = True
-    mission = score(_Draws(case, found).draw, is_known, found.stories.num_hypotheses)
+    mission = score(MissionDraws(case, found).draw, is_known, found.stories.num_hypotheses)
     return WholeCells(windows, mission, case.windows.batch.num_windows)
 
 
 @dataclass(frozen=True, eq=False)
-class _Draws:
+class MissionDraws:
     """Mission hypotheses at the steps of windows."""
 
     case: Case
@@ -110,7 +110,7 @@ def _time_ns(case: Case, window: int) -> Int64s:
     return np.asarray(case.windows.origins_ns[window] + steps * case.windows.step_ns)
 
 
-def _chosen(case: Case, found: MissionStories, own: Cells) -> Bools:
+def told_once(case: Case, found: MissionStories, own: Cells) -> Bools:
     """Which cells count [C]: those of the past where mission hypotheses tell of the agent, each step in its best window."""
     time_ns = case.windows.origins_ns[own.window] + own.step.astype(np.int64) * case.windows.step_ns
     span_ns = np.full((len(case.windows.agent_ids), 2), np.iinfo(np.int64).min)

@@ -12,7 +12,8 @@ from torch import Tensor
 from cadence.arrays import Float64s, Int64s
 from cadence.bank.pool import BankPool
 from cadence.bank.smoother import Nodes
-from cadence.retrospect.draw import Tracks, draw_tracks
+from cadence.retrospect.draw import draw_tracks
+from cadence.retrospect.filtering import Tracks
 from cadence.retrospect.limits import MissionLimits
 from cadence.retrospect.timeline import Timeline
 from cadence.seeds import derived_seed, derived_seeds

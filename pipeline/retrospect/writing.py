@@ -32,14 +32,21 @@ def write_mission(
     sources = MissionSources.read(directory, config.num_hypotheses, config.seed)
     obstacles = read_obstacles(directory / OBSTACLES_NAME)
     with one_thread():
-        return _draw(sources, config, obstacles, folder, progress, num_threads or num_cores())
+        data = sources.fitting(config.seed)
+        mission, summary = drawn_stories(sources, data, config, obstacles, progress, num_threads or num_cores())
+    write_stories(mission, folder)
+    return summary
 
 
-def _draw(
-    sources: MissionSources, config: RetrospectConfig, obstacles: Obstacles, folder: Path, progress: Progress, num_threads: int
-) -> dict[str, Any]:
-    """All stories into their table; what the summary says of them."""
-    data = sources.fitting(config.seed)
+def drawn_stories(
+    sources: MissionSources,
+    data: FittingData,
+    config: RetrospectConfig,
+    obstacles: Obstacles,
+    progress: Progress,
+    num_threads: int,
+) -> tuple[MissionStories, dict[str, Any]]:
+    """The stories of a mission, and what the stage's summary says of them; `data` as `sources` have it."""
     timing = _timing(sources, config)
     draw = _mission_draw(sources, data, timing, config, obstacles)
     shape = (config.num_hypotheses, len(sources.agent_ids), len(timing.time_ns), 2)
@@ -52,8 +59,7 @@ def _draw(
     weight = np.full(config.num_hypotheses, 1.0 / config.num_hypotheses)
     stories = Stories(draw.timeline.time_s.numpy(), position, weight, sources.agent_ids)
     mission = MissionStories(sources.frame, sources.log_id, int(timing.time_ns[0]), stories, timing.blocks)
-    write_stories(mission, folder)
-    return {
+    return mission, {
         "num_hypotheses": config.num_hypotheses,
         "num_agents": len(sources.agent_ids),
         "num_steps": len(timing.time_ns),

@@ -1,4 +1,5 @@
 import dataclasses
+import itertools
 import math
 
 import numpy as np
@@ -10,10 +11,12 @@ from scipy.stats import ks_2samp
 from cadence.bank.bank import Bank
 from cadence.bank.components import concatenate, constant_velocity, home_ranges, ornstein_uhlenbeck, transition
 from cadence.bank.fitting import DIFFUSE_STEPS, FLOOR_STEPS
-from cadence.bank.smoother import Nodes
+from cadence.bank.mixture import merge_grid
+from cadence.bank.smoother import Nodes, diffuse_start, filter_from
 from cadence.metrics import coverage
-from cadence.retrospect.chains import drawn_chains, stretch_evidence
-from cadence.retrospect.draw import Tracks, draw_tracks
+from cadence.retrospect.chains import Chains
+from cadence.retrospect.draw import draw_tracks
+from cadence.retrospect.filtering import Plan, Tracks
 from cadence.retrospect.timeline import Timeline
 
 
@@ -163,18 +166,53 @@ def test_a_model_that_cannot_have_been_is_not_drawn():
     tracks = tracks_of(time_s[None], torch.stack([x, 0 * x], -1)[None], sigma_m=0.02)
     bank = Bank(ornstein_uhlenbeck([100.0], [0.01, 1.5], [0.0]), speed_mps=1.0)
     timeline = timeline_of(128, 64)
-    evidence = stretch_evidence(bank, tracks.rows, timeline)
-    chains = drawn_chains(bank, evidence, timeline, torch.rand(1, 200, 2, generator=torch.Generator().manual_seed(0)).double())
-    assert (chains[0, :, 0] == 0).all() and (chains[0, :, 1] == 1).all()
+    found = Plan.of([bank], torch.zeros(60).long(), tracks, timeline).filtered()
+    for stretch in (0, 1):
+        share = torch.softmax(found[stretch].log_weight, 0)[found[stretch].model == stretch].sum()
+        assert float(share) > 0.999
 
 
-def test_chains_keep_their_model_as_the_bank_says():
+def test_a_model_is_kept_as_the_bank_says():
     bank = Bank(ornstein_uhlenbeck([100.0], [0.5, 0.5000001], [0.0]), speed_mps=1.0, switch_rate=0.02)
-    timeline = timeline_of(160, 16)
-    uniform = torch.rand(1, 4000, 10, generator=torch.Generator().manual_seed(1)).double()
-    chains = drawn_chains(bank, torch.zeros(1, 10, 2).double(), timeline, uniform)[0]
-    changes = (chains[:, 1:9] != chains[:, :8]).double().mean()
-    assert abs(float(changes) - 0.5 * (1.0 - math.exp(-0.02 * 16))) < 0.01
+    chains = Chains.of(bank, torch.zeros(1, 10, 2).double(), timeline_of(160, 16))
+    uniform = torch.rand(1, 40000, generator=torch.Generator().manual_seed(1)).double()
+    first, log_weight = chains.proposed(0, None, uniform)
+    second, _ = chains.proposed(1, first, uniform.flip(1))
+    assert float(log_weight.abs().max()) < 1e-9  # nothing is known: what is proposed is the prior
+    assert abs(float((second != first).double().mean()) - 0.5 * (1.0 - math.exp(-0.02 * 16))) < 0.01
+
+
+def test_what_led_across_a_gap_is_weighed_as_whole_chains_are():
+    # seen at rest, then far away: one of the three stretches was a fast one, and nobody was seen in the second
+    time_s = torch.tensor([[0.0, 1.0, 14.0, 40.0, 44.0]]).double()
+    x = torch.tensor([0.0, 0.05, 0.4, 9.0, 9.5]).double()
+    tracks = tracks_of(time_s, torch.stack([x, 0 * x], -1)[None], sigma_m=0.02)
+    bank = Bank(ornstein_uhlenbeck([10.0], [0.05, 0.8], [0.0]), speed_mps=1.0, switch_rate=0.03)
+    timeline = timeline_of(45)
+    plan = Plan.of([bank], torch.zeros(2000).long(), tracks, timeline)
+    log_weight = {chain: _log_weight(plan, chain) for chain in itertools.product((0, 1), repeat=3)}
+    total = np.logaddexp.reduce(list(log_weight.values()))
+    exact = sum(math.exp(value - total) for chain, value in log_weight.items() if chain[2] == 1)
+    last = plan.filtered()[2]
+    share = torch.softmax(last.log_weight, 0)[last.model == 1].sum()
+    assert 0.1 < exact < 0.9
+    assert float(share) == pytest.approx(exact, abs=0.05)
+
+
+def _log_weight(plan: Plan, chain: tuple[int, ...]) -> float:
+    """Log of prior times likelihood of the detections of a plan of one track under a whole chain of models."""
+    chains, total = plan.chains[0], math.log(0.5)
+    model = plan.models[torch.tensor(chain[:1])]
+    mean, covariance = diffuse_start(model, plan.nodes.position_m[:1, 0], torch.tensor([plan.diffuse_m]))
+    for stretch, number in enumerate(chain):
+        if stretch:
+            total += math.log(chains.passes(stretch, torch.tensor(chain[stretch - 1]))[number])
+        ends = torch.tensor([16.0 * stretch, min(16.0 * stretch + 16.0, 44.0)]).double()
+        nodes, _ = merge_grid(plan.detections(stretch)[:1], ends)
+        filtered = filter_from(plan.models[torch.tensor([number])], nodes, mean, covariance)
+        mean, covariance = filtered.mean[:, -1], filtered.covariance[:, -1]
+        total += float(filtered.log_likelihood)
+    return total
 
 
 def test_stretches_must_be_in_order():
