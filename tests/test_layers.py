@@ -30,7 +30,7 @@ FLOORS = {
         {"association", "stories", "types"},
         {"answers", "bank", "height", "recordings"},
         {"evidence", "network", "worlds"},
-        {"diffusion"},
+        {"bearings", "diffusion"},
         {"baselines", "retrospect"},
         {"training"},
     ),
