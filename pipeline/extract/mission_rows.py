@@ -176,6 +176,11 @@ def _check_any(role: str, rows: Positions, counts: Counter[str], suspicions: Sus
         return
     if suspicions:
         reason = f"nothing that can be meant is left of the {role}: {'; '.join(few(suspicions.lines()))}"
+    elif counts["static"]:
+        raise NothingDetectedError(
+            f"all {counts['static']} returns stand, by the Doppler of their scans; is_static_used = true in the "
+            "[[extract.detections]] of the radar uses them"
+        )
     elif counts["no_transform"]:
         reason = (
             f"for none of the {role} the log has a transform near enough in time; "

@@ -11,6 +11,7 @@ import numpy as np
 
 from cadence.arrays import Bools, Float64s
 from cadence.errors import ConfigError
+from cadence.measurement.doppler import are_static
 from cadence.measurement.polar import cartesian, is_nearly_normal
 from pipeline.extract.cameras import Camera
 from pipeline.extract.channel_reader import ChannelReader
@@ -21,6 +22,8 @@ _LITTLE_MORE: Final = 1.01
 """Angles that are counted on over a full turn by a rounding are no degrees."""
 _MOST_SIGMA_RAD: Final = 0.35
 """Beyond 20 degrees a beam tells a side of the sensor and no position."""
+_STANDS_MPS: Final = 0.5
+"""What a radar of vehicles tells of range rates, and less than somebody who walks towards it."""
 _OF_SIZE: Final = 0.1
 """Where in its box a target is: a standard deviation of the box's centre in widths and heights of it."""
 _UNITS: Final = {"range": "m", "bearing": "degrees", "elevation": "degrees", "range_rate": "m/s"}
@@ -108,6 +111,21 @@ def seen(reader: ChannelReader, rows: Positions, camera: Camera) -> Measured:
     across, upright = (exact / focal for exact, focal in zip(pixels, camera.focal, strict=True))
     nothing = np.full(len(rows), np.nan)
     return Measured(nothing, -np.arctan(right), elevation, nothing, nothing, across, upright, nothing)
+
+
+def stand_still(reader: ChannelReader, rows: Positions, found: Measured, has_name: Bools) -> Bools:
+    """Which rows [N] without a name stand, by the Doppler of their scan; none where the source wants them, or measures none."""
+    rates = reader.measured()["range_rate"]
+    nothing = np.zeros(len(rows), np.bool_)
+    if reader.source.is_static_used or has_name.all() or not (np.nan_to_num(rates) != 0).any():
+        return nothing
+    flat = np.cos(np.nan_to_num(found.elevation_rad))
+    ways = np.column_stack([flat * np.cos(found.bearing_rad), flat * np.sin(found.bearing_rad)])
+    usable = np.where(found.is_place & ~has_name, rates, np.nan)
+    order = np.argsort(rows.message, kind="stable")
+    for scan in np.split(order, np.flatnonzero(np.diff(rows.message[order])) + 1):
+        nothing[scan] = are_static(ways[scan], usable[scan], _STANDS_MPS)
+    return nothing
 
 
 def _from_east(reader: ChannelReader, bearing_rad: Float64s) -> Float64s:

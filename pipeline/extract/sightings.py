@@ -16,7 +16,7 @@ import numpy as np
 from cadence.arrays import Bools, Float64s, Int64s
 from pipeline.extract.cameras import Camera
 from pipeline.extract.channel_reader import ChannelReader
-from pipeline.extract.polar import Measured, as_positions, measured, seen
+from pipeline.extract.polar import Measured, as_positions, measured, seen, stand_still
 from pipeline.extract.positions import Positions
 from pipeline.measurements import MeasurementRows
 from pipeline.suspicions import Suspicions
@@ -79,7 +79,9 @@ def read_parts(
         is_alone = has_name & (np.isnan(rows.first) != np.isnan(rows.second))
         is_apart = (each.is_bent & is_named) | is_alone
         if is_place:
-            positions += [(reader, as_positions(rows, each)[~is_apart])]
+            is_used = ~is_apart & ~stand_still(reader, rows, each, has_name)
+            counts["static"] += int((~is_apart & ~is_used).sum())
+            positions += [(reader, as_positions(rows, each)[is_used])]
         others = _sightings(rows, each, is_apart | (not is_place))
         counts["dropped_nonfinite"] += 0 if is_place else len(rows) - len(others)
         if reader.is_camera:

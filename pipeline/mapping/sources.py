@@ -31,7 +31,7 @@ _MEASURED = {
     "range_rate": "range_rate_sigma_mps",
 }  # fmt: skip
 """What a sensor may have measured, and the setting that says how exactly where messages do not."""
-_OF_BEARINGS = ("bearing_unit", "bearing_convention", "observer", "observer_x_m", "observer_latitude")
+_OF_BEARINGS = ("is_static_used", "bearing_unit", "bearing_convention", "observer", "observer_x_m", "observer_latitude")
 _OF_PIXELS = ("box_width", "box_height", "pixel_sigma", "camera_info")
 
 
@@ -80,6 +80,8 @@ class SourceConfig:
     box_width, box_height   message paths of its size in pixels, of which a tenth is the standard deviation (one at least)
     pixel_sigma   standard deviation in pixels instead
     camera_info topic of the camera's sensor_msgs/CameraInfo; default: the one whose name is nearest
+    is_static_used   true: also returns without a name that stand, by their range rates; default: where most of a scan fits one
+                motion of the radar, these are left out
     observer    the sensor of [[extract.poses]] from whose places it was measured; "{sensor}": the one that the message or the
                 topic names; default: the origin of the frame that frame_id names, at the stamp, by the log's transforms
     observer_x_m, observer_y_m   where it was measured from, in the mission frame, where that stands
@@ -147,6 +149,7 @@ class SourceConfig:
     box_height: str | None = None
     pixel_sigma: float | None = None
     camera_info: str | None = None
+    is_static_used: bool | None = None
     observer: str | None = None
     observer_x_m: float | None = None
     observer_y_m: float | None = None

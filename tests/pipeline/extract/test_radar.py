@@ -11,7 +11,7 @@ from pyproj import Geod
 from test_extract import Extracted, fails, run
 from test_sensor_frames import MAST, TARGET, ros2_row, seen, ship
 
-from cadence.errors import ConfigError, InputError
+from cadence.errors import ConfigError, InputError, NothingDetectedError
 from pipeline.frames import to_local
 
 RADARS = Builder(store_with(RADAR))
@@ -195,6 +195,41 @@ def test_a_radar_that_nothing_joins_is_refused_as_any_sensor(tmp_path: Path) -> 
     rows = [ros2_row(0.5 * i, "map", "ship", ship(0.5 * i)) for i in range(8)]
     rows += [scan(float(i), (100.0, 0.1, 0.0)) for i in range(4)]
     fails(tmp_path, rows, InputError, "in the frame radar, which no transform of the log joins")
+
+
+def street(is_filled: bool = True, is_empty: bool = False) -> list[Row]:
+    """A radar on the road among twelve walls, at 10 m/s to the east, and a car that goes before it at 15."""
+    rng, rows = np.random.default_rng(1), []
+    walls = np.column_stack([rng.uniform(10.0, 90.0, 12), rng.uniform(-30.0, 30.0, 12), np.zeros(12)])
+    for i in range(6):
+        items = [(wall - [1.0 * i, 0.0, 0.0], -10.0) for wall in walls]
+        items += [] if is_empty else [(np.array([40.0 + 0.5 * i, 3.0, 0.0]), 5.0)]
+        returns = [(*polar(place), along * place[0] / np.linalg.norm(place) if is_filled else 0.0) for place, along in items]
+        message = [
+            RADARS("radar_msgs/msg/RadarReturn", range=r, azimuth=a, elevation=e, doppler_velocity=v) for r, a, e, v in returns
+        ]
+        header = RADARS.header("map", 1_700_000_000_000_000_000 + i * 10**8)
+        rows.append(RADARS.cdr_row(RADARS("radar_msgs/msg/RadarScan", header=header, returns=message), "/radar", 0.1 * i))
+    return rows
+
+
+def test_walls_are_left_out_by_their_doppler(tmp_path: Path) -> None:
+    found = run(tmp_path, street())
+    assert found.summary["num_detections"] == 6 and found.summary["static"] == 72
+    np.testing.assert_allclose(found.detections["x_m"].to_numpy(), 40.0 + 0.5 * np.arange(6), atol=0.1)
+    told = run(tmp_path, street(), detections=[{"topic": "/radar", "is_static_used": True}])
+    assert told.summary["num_detections"] == 78 and "static" not in told.summary
+    # a radar that fills in no Doppler says nothing of what stands
+    assert run(tmp_path, street(is_filled=False)).summary["num_detections"] == 78
+
+
+def test_where_everything_stands_nothing_was_detected(tmp_path: Path) -> None:
+    fails(
+        tmp_path,
+        street(is_empty=True),
+        NothingDetectedError,
+        "all 72 returns stand, by the Doppler of their scans; is_static_used",
+    )
 
 
 def test_clutter_is_left_out_by_a_condition(tmp_path: Path) -> None:
