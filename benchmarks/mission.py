@@ -13,7 +13,7 @@ import json
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -69,6 +69,7 @@ class Prepared:
 
     found     the mission hypotheses
     draw_s    processor seconds that they took, models fitted
+    borders   how they move at the borders of stretches, see `borders`
     is_asked  [B, A, T] each step once, in some of the windows
     """
 
@@ -76,6 +77,7 @@ class Prepared:
     data: FittingData
     found: MissionStories
     draw_s: float
+    borders: dict[str, float]
     is_asked: Tensor
 
 
@@ -89,7 +91,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     found: dict[tuple[str, int], list[dict[str, dict[str, object]]]] = {}
     for log in options.logs:
         for rate in options.rates if log != PATROL else (0.0,):
-            for seed in options.seeds:
+            for seed in options.seeds if log != PATROL else options.patrols:
                 found.setdefault((log, round(100 * rate)), []).append(run(log, rate, seed, options, progress))
     facts = publishing.facts_of("mission", arguments) | {"num_hypotheses": options.hypotheses}
     publishing.publish(Measurement("mission", facts, {"mission": rows_of(found)}), section, options.publish)
@@ -142,10 +144,15 @@ def prepare_log(
     sources = MissionSources(Told(), {}, frame, str(detections["log_id"][0]), detections, grid, names, shares)
     data.fitted_bank()
     begun_s = time.process_time()
-    config = RetrospectConfig(num_hypotheses=num_hypotheses, seed=seed)
-    found, _ = drawn_stories(sources, data, config, Obstacles.none(), progress, 1)
+    settings = RetrospectConfig(num_hypotheses=num_hypotheses, seed=seed)
+    found, _ = drawn_stories(sources, data, settings, Obstacles.none(), progress, 1)
     draw_s = time.process_time() - begun_s
-    return Prepared(case, data, found, draw_s, _asked(case, found, most_tracks))
+    block_steps = grid.history_steps
+    other_steps = block_steps - block_steps // 4
+    again = replace(settings, seed=seed + 1000, block_steps=other_steps)
+    other, _ = drawn_stories(sources, data, again, Obstacles.none(), progress, 1)
+    at_borders = borders(found, other, block_steps, other_steps)
+    return Prepared(case, data, found, draw_s, at_borders, _asked(case, found, most_tracks))
 
 
 def _asked(case: Case, found: MissionStories, most_tracks: int) -> Tensor:
@@ -188,7 +195,7 @@ def measured(name: str, prepared: Prepared, num_hypotheses: int, progress: Progr
         "motion": {row.metric: row.value for row in motion_rows(name, motion.laws(), truth.laws()) if row.part == "past"},
         "cost_s": prepared.draw_s if name == MISSION else cost_s,
         "share_drawn": float(is_asked.any(-1).any(-1).double().mean()),
-        **(borders(prepared.found) if name == MISSION else {}),
+        **(prepared.borders if name == MISSION else {}),
     }
 
 
@@ -203,29 +210,34 @@ def gaps(case: Case, agent: Int32s, time_ns: Int64s) -> Float64s:
     return found
 
 
-def borders(mission: MissionStories) -> dict[str, float]:
-    """Chances (Kolmogorov and Smirnov) that steps, bends and turns at the borders of stretches are as those inside.
+def borders(mission: MissionStories, other: MissionStories, block_steps: int, other_steps: int) -> dict[str, float]:
+    """How far the laws of steps, bends and turns at borders of stretches are from those of the same steps inside.
 
-    Of one hypothesis in ten, as its steps depend on each other: chances are too small rather than too great.
+    The same mission drawn again with borders elsewhere; distances of Kolmogorov and Smirnov, with their chances. Hypotheses
+    that share a chain depend on each other, so that chances are too small rather than too great.
     """
-    stories = mission.stories
-    way_m = stories.position_m[::10].reshape(-1, len(stories.time_s), 2)
-    step_s = np.diff(stories.time_s)
-    velocity = np.diff(way_m, axis=1) / step_s[:, None]
-    bend = np.hypot(*np.diff(velocity, axis=1).transpose(2, 0, 1))
-    is_even = np.isclose(np.diff(step_s), 0.0, atol=1e-6 * step_s.min())
-    at = np.zeros(len(stories.time_s), dtype=bool)
-    at[[block.first for block in mission.blocks if block.first]] = True
-    at = at[1:-1]
-    speed = np.hypot(*velocity.transpose(2, 0, 1))[:, 1:]
-    cross = velocity[:, :-1, 0] * velocity[:, 1:, 1] - velocity[:, :-1, 1] * velocity[:, 1:, 0]
-    turn = np.arctan2(np.abs(cross), (velocity[:, :-1] * velocity[:, 1:]).sum(-1))
+    num_steps = len(mission.stories.time_s)
+    at = np.arange(block_steps, num_steps - 1, block_steps)
+    at = at[at % other_steps != 0]
     found = {}
-    for law, value in (("speed", speed), ("acceleration", bend), ("turn", turn)):
-        inside, border = (value[:, is_even & where] for where in (~at, at))
-        inside, border = inside[np.isfinite(inside)], border[np.isfinite(border)]
-        found[f"border_{law}_p"] = float(ks_2samp(inside, border).pvalue) if len(border) else float("nan")
+    for law, border in _laws_of_motion(mission, at).items():
+        inside = _laws_of_motion(other, at)[law]
+        test = ks_2samp(border, inside) if len(border) and len(inside) else None
+        found[f"border_{law}"] = float("nan") if test is None else float(test.statistic)
+        found[f"border_{law}_p"] = float("nan") if test is None else float(test.pvalue)
     return found
+
+
+def _laws_of_motion(mission: MissionStories, at: Int64s) -> dict[str, Float64s]:
+    """Speeds into steps, and the bends and turns there, of all tracks that are there."""
+    step_s = np.diff(mission.stories.time_s)
+    velocity = np.diff(mission.stories.position_m, axis=2) / step_s[:, None]
+    before, after = (velocity[:, :, at + shift].reshape(-1, 2) for shift in (-1, 0))
+    is_there = np.isfinite(before + after).all(axis=1)
+    before, after = before[is_there], after[is_there]
+    cross = before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0]
+    turn = np.arctan2(np.abs(cross), (before * after).sum(axis=1))
+    return {"speed": np.hypot(*before.T), "acceleration": np.hypot(*(after - before).T), "turn": turn}
 
 
 def rows_of(found: dict[tuple[str, int], list[dict[str, dict[str, object]]]]) -> list[publishing.Row]:
@@ -267,12 +279,18 @@ def _others(runs: Sequence[dict[str, dict[str, object]]]) -> publishing.Row:
     row: publishing.Row = {}
     for name in (MISSION, WINDOWS):
         for metric in MOTION_METRICS:
-            row[f"{name}_{metric}"] = float(np.nanmean([each[name]["motion"].get(metric, np.nan) for each in runs]))
+            row[f"{name}_{metric}"] = _mean([each[name]["motion"].get(metric, np.nan) for each in runs])
     for law in MOTION_METRICS.values():
-        row[f"border_{law}_p"] = float(np.min([each[MISSION][f"border_{law}_p"] for each in runs]))
+        for column in (f"border_{law}", f"border_{law}_p"):
+            row[column] = _mean([each[MISSION][column] for each in runs])
     # windows that are scored are some of all; mission hypotheses are drawn of all
     windows_s = sum(each[WINDOWS]["cost_s"] / each[WINDOWS]["share_drawn"] for each in runs)
     return row | {"cost_ratio": sum(each[MISSION]["cost_s"] for each in runs) / windows_s}
+
+
+def _mean(values: Sequence[float]) -> float:
+    known = [value for value in values if np.isfinite(value)]
+    return float(np.mean(known)) if known else float("nan")
 
 
 def section(measured_: Measurement) -> str:
@@ -295,8 +313,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--logs", nargs="+", choices=LOGS, default=LOGS)
     parser.add_argument("--rates", nargs="+", type=float, default=list(RATES))
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1])
+    parser.add_argument("--patrols", nargs="+", type=int, default=[0, 1, 2, 3, 4, 5], help="seeds of the simulated patrols")
     parser.add_argument("--hypotheses", type=int, default=60, help="joint samples of each (default %(default)s)")
-    parser.add_argument("--most-tracks", type=int, default=80, help="scored of a log, evenly spread (default %(default)s)")
+    parser.add_argument("--most-tracks", type=int, default=60, help="scored of a log, evenly spread (default %(default)s)")
     parser.add_argument("--again", action="store_true", help="draw mission hypotheses again though they have results")
     parser.add_argument("--publish", type=Path, metavar="DOCS", help="write numbers and section below this folder")
     return parser

@@ -19,6 +19,7 @@ from pipeline.obstacle_file import OBSTACLES_NAME, read_obstacles
 from pipeline.progress import Progress
 from pipeline.retrospect.config import RetrospectConfig
 from pipeline.retrospect.draws import MissionDraw
+from pipeline.retrospect.heights import heights_beside
 from pipeline.retrospect.sources import MissionSources
 from pipeline.retrospect.timing import Timing, plan_times
 from pipeline.stories import MissionStories, write_stories
@@ -57,8 +58,11 @@ def drawn_stories(
             num_tracks, num_replaced = num_tracks + len(drawn), num_replaced + replaced
             bar.update(1)
     weight = np.full(config.num_hypotheses, 1.0 / config.num_hypotheses)
-    stories = Stories(draw.timeline.time_s.numpy(), position, weight, sources.agent_ids)
-    mission = MissionStories(sources.frame, sources.log_id, int(timing.time_ns[0]), stories, timing.blocks)
+    time_s, start_ns, height = draw.timeline.time_s.numpy(), int(timing.time_ns[0]), None
+    if data.tracks.height_m is not None:
+        height = heights_beside(data.fitted_heights(), sources.shares, position, time_s, start_ns, config.seed)
+    stories = Stories(time_s, position, weight, sources.agent_ids, height)
+    mission = MissionStories(sources.frame, sources.log_id, start_ns, stories, timing.blocks)
     return mission, {
         "num_hypotheses": config.num_hypotheses,
         "num_agents": len(sources.agent_ids),
