@@ -19,7 +19,10 @@ from cadence.errors import DeviceError
 from pipeline.view import browser
 from pipeline.view.server import Server
 
-FAST = ["--set", "infer.checkpoint=none", "--set", "infer.num_hypotheses=4", "--set", "infer.grid.stride_steps=64"]
+FAST = [
+    "--set", "infer.checkpoint=none", "--set", "infer.num_hypotheses=4", "--set", "infer.grid.history_steps=16",
+    "--set", "infer.grid.horizon_steps=8", "--set", "infer.grid.stride_steps=16",
+]  # fmt: skip
 
 
 @pytest.fixture
