@@ -115,7 +115,7 @@ def batch_summary(outcomes: Sequence[LogOutcome], told: Collection[str] = ()) ->
         for stage in outcome.stages:
             lines += [f"{outcome.task.name}: damaged: {problem}" for problem in stage.summary.get("problems", ())]
             lines += [f"{outcome.task.name}: suspected {line}" for line in few(suspicions_in(stage.summary))]
-        lines += [f"{outcome.task.name}: assumed: {line}" for line in _assumptions(summary)]
+        lines += [f"{outcome.task.name}: assumed: {line}" for line in (*few(summary.get("taken", ())), *_assumptions(summary))]
         lines += [f"{outcome.task.name}: note: {line}" for line in summary.get("remarks", ())]
     return "\n".join([*_table(rows), *lines, *_to_open(outcomes)])
 

@@ -101,6 +101,7 @@ def write_tables(log: MissionLog, folder: Path, config: ExtractConfig, progress:
     summary = summarise(log, readers, detections.positions, truth, poses, frame, counts, suspicions, len(obstacles))
     told |= {"static": counts["static"]} if counts["static"] else {}
     told |= {"accuracy": records, "unused": unused, "transforms": transforms.summary(counts)}
+    told |= {"taken": taken} if taken else {}
     return summary | told | ({"height": dict(heights.record)} if heights.record else {})
 
 

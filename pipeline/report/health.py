@@ -73,12 +73,15 @@ def _extraction(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
         rows = [("left out", "nothing")]
     for who, words in map(in_words, summary.get("accuracy") or []):
         rows.append(("accuracy, where none is stated", text(f"{who}: {words}")))
+    for line in summary.get("taken") or []:
+        rows.append(("accuracy, where none is stated", text(line)))
     if words := measurement_words(summary.get("measurements") or {}):
         rows.append(("bearings and ranges", text(words)))
     unused = summary.get("unused") or {}
     rows += [("may hold detections, not used", text(f"{channel}: {why}")) for channel, why in unused.items()]
     # Other parts of the page tell of these already.
-    known = {*LEFT_OUT, "lost_spans_ns", "is_complete", "frame", "suspicions", "unused", "accuracy", "measurements", *EXTRACTED}
+    known = {*LEFT_OUT, *EXTRACTED, "lost_spans_ns", "is_complete", "frame", "suspicions", "unused"}
+    known |= {"accuracy", "taken", "measurements"}
     flat = dict(flatten(summary))
     found = [(text(words), text(flat[key])) for key, words in EXTRACTED.items() if flat.get(key)]
     # What else was counted is told where there was any.

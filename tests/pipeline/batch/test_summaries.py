@@ -65,6 +65,11 @@ def test_what_was_assumed_of_detections_without_identity_is_said_with_the_lines_
     assert "assumed" not in batch_summary([dataclasses.replace(GOOD, stages=(extract,))])
 
 
+def test_what_accuracy_was_taken_is_said_at_the_end_too():
+    extract = StageResult("extract", "done", (), {"taken": ["/scan: 0.5 m in range are taken"]})
+    assert "a: assumed: /scan: 0.5 m in range are taken" in batch_summary([dataclasses.replace(GOOD, stages=(extract,))])
+
+
 def test_logs_for_programs():
     records = json.loads(to_json([log_record(GOOD), log_record(BAD)]))
     assert records[0]["stages"][0] == {

@@ -60,6 +60,8 @@ def test_returns_come_out_where_the_target_was_whatever_the_radar_did(tmp_path: 
 def test_a_scan_is_read_without_settings(tmp_path: Path) -> None:
     found = run(tmp_path, on_board())
     assert found.summary["num_detections"] == 12 and found.summary["unused"] == {}
+    (taken,) = found.summary["taken"]
+    assert "0.5 m in range and 1° in bearing are taken, as its type states no accuracy" in taken
     # 1 degree at 47 m is .8 m across and .5 m along; the mast is tilted, and up are 2 degrees
     sigma_m = np.sqrt(found.detections["cov_xx_m2"].to_numpy() + found.detections["cov_yy_m2"].to_numpy())
     assert (sigma_m > 0.8).all() and (sigma_m < 1.5).all()
