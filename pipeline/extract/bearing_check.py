@@ -53,8 +53,6 @@ def _errors(rows: Sightings, detections: Positions) -> tuple[Float64s, Float64s,
     """Of the bearings of a topic that can be compared [K]: bearing, standard deviation, measured less expected."""
     order = np.argsort(rows.key, kind="stable")
     sensors, ends = (rows[order[rows.is_sensor[order] == is_sensor]] for is_sensor in (True, False))
-    if len(sensors) != len(ends) or not len(sensors):
-        return np.zeros(0), np.zeros(0), np.zeros(0)
     bearing = np.arctan2(ends.second - sensors.second, ends.first - sensors.first)
     place_m = np.full((len(sensors), 2), np.nan)
     blur_m = np.full(len(sensors), np.inf)

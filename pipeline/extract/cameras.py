@@ -111,7 +111,7 @@ def _read(log: MissionLog, reader: ChannelReader, channel: Channel) -> Camera:
 
 def _camera(message: Any, topic: str, where: str) -> Camera:
     """The camera of one message of any version of ROS, which differ in the case of letters."""
-    matrix, distortion = (np.asarray(_field(message, name), dtype=np.float64).ravel() for name in ("k", "d"))
+    matrix, distortion = _numbers(_field(message, "k")), _numbers(_field(message, "d"))
     if len(matrix) != 9 or not (np.isfinite(matrix).all() and matrix[0] > 0 and matrix[4] > 0):
         raise ConfigError(f"{where} is not calibrated (its matrix K has no focal length); give another camera_info")
     model = str(_field(message, "distortion_model"))
@@ -120,6 +120,14 @@ def _camera(message: Any, topic: str, where: str) -> Camera:
     bends = (*distortion.tolist(), 0.0, 0.0, 0.0, 0.0, 0.0)[:5]
     header = _field(message, "header")
     return Camera(topic, (matrix[0], matrix[4]), (matrix[2], matrix[5]), bends, str(_field(header, "frame_id")).lstrip("/"))
+
+
+def _numbers(value: Any) -> Float64s:
+    """Numbers of an array; none where it is none."""
+    try:
+        return np.asarray(value, dtype=np.float64).ravel()
+    except (TypeError, ValueError):
+        return np.zeros(0)
 
 
 def _field(message: Any, name: str) -> Any:

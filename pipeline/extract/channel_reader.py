@@ -99,7 +99,7 @@ class ChannelReader:
             if not self.conditions.hold_at(conditions, place):
                 self.counts[self._unmet] += 1
                 continue
-            values: dict[str, Any] = dict.fromkeys((*_OTHERS, *self.more))
+            values: dict[str, Any] = dict.fromkeys(_OTHERS)
             for name, located in found:
                 values[name] = located[place] if place in located else at_place(located, place)
             covariance = self._covariance(values["covariance"], values["covariance_type"], values["sigma"])
@@ -107,7 +107,8 @@ class ChannelReader:
             time_ns = default_ns if values["time"] is None else values["time"]
             self.rows.integers.extend((time_ns, raw.log_time_ns, raw.sequence, self.counts["messages"]))
             self.rows.floats.extend((_number(first), _number(second), _number(z), _number(values["score"]), *covariance))
-            self._measured.extend(_number(values[name]) for name in self.more)
+            if self.more:
+                self._measured.extend(_number(values.get(name)) for name in self.more)
             self.rows.agents.append(self._identity("agent", values["agent"], place))
             self.rows.sensors.append(self._identity("sensor", values["sensor"], place))
             self.rows.frame_ids.append(values["frame_id"] or "")

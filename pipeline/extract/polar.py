@@ -5,7 +5,7 @@ was, east and north about that place (`observers`).
 """
 
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
@@ -49,10 +49,6 @@ class Measured:
     bearing_sigma_rad: Float64s
     elevation_sigma_rad: Float64s
     range_rate_sigma_mps: Float64s
-
-    def __getitem__(self, rows: Any) -> "Measured":
-        """The rows of a mask or of indices."""
-        return Measured(*(column[rows] for column in vars(self).values()))
 
     @property
     def is_place(self) -> Bools:

@@ -36,6 +36,6 @@ def test_all_in_one_direction_tell_a_motion_along_it() -> None:
 
 
 def test_one_ship_of_many_returns_is_no_surroundings() -> None:
-    bearing = 0.7 + np.linspace(-0.1, 0.1, 20)
+    bearing = 0.7 + np.linspace(-0.2, 0.2, 20)
     ways = np.column_stack([np.cos(bearing), np.sin(bearing)])
     assert not are_static(ways, ways @ np.array([-6.0, 2.0]), 0.3).any()

@@ -1,5 +1,6 @@
 """Boxes of a camera as directions: pinhole, distortion, transforms of an optical frame, and what is refused."""
 
+import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -108,6 +109,8 @@ def test_straight_down_it_has_no_bearing(tmp_path: Path) -> None:
         ([info("/one/info"), info("/two/info")], {}, "nothing says which of /one/info, /two/info; give camera_info"),
         ([info()], {"camera_info": "/cam/camera_inf"}, "camera_info '/cam/camera_inf' is no CameraInfo"),
         ([info(K=[0.0] * 9)], {}, "its camera /cam/camera_info is not calibrated"),
+        ([info(K="none")], {}, "its camera /cam/camera_info is not calibrated"),
+        ([dataclasses.replace(info(), message=b"{")], {}, "its camera /cam/camera_info cannot be decoded"),
         ([info(D=[0.1] * 4, distortion_model="equidistant")], {}, "has the distortion .equidistant. of 4 numbers"),
         ([info(), info(K=[700.0, 0, 320, 0, 700, 240, 0, 0, 1])], {}, "changes its focal length or centre, as where it zooms"),
         ([info()], {"observer_x_m": 0.0, "observer_y_m": 0.0}, "observer_x_m is of bearings"),

@@ -121,6 +121,29 @@ def test_from_an_observer_that_moves_in_latitude_and_longitude(tmp_path: Path) -
     np.testing.assert_allclose(found.detections["y_m"].to_numpy(), y_m, atol=0.1)
 
 
+def test_from_an_observer_whose_metres_are_north_east_down(tmp_path: Path) -> None:
+    """At 300 m north, 40 m east and 20 m up; the target is due east of it, narrow to the east, wide to the north."""
+    rows: list[Row] = []
+    for i in range(8):
+        place = {"timestamp": stamp(float(i)), "xy_valid": True, "x": 300.0, "y": 40.0, "z": -20.0}
+        rows += [
+            Row("/drone/pose", "px4_msgs/msg/VehicleLocalPosition", float(i), place),
+            finder(i + 0.25, 1000.0, np.pi / 2, up=0.1),
+        ]
+    source = FINDER | {"bearing_convention": "compass", "observer": "drone", "agent": "fox", "bearing_sigma_deg": 2.0}
+    source |= {"elevation": "up", "elevation_sigma_deg": 0.1}
+    found = run(tmp_path, rows[:-1], detections=[source], poses=[{"topic": "/{sensor}/pose"}])
+    seen_at = [found.detections[name].to_numpy()[0] for name in ("x_m", "y_m", "z_m")]
+    assert seen_at == pytest.approx([40.0 + 1000.0 * np.cos(0.1), 300.0, 20.0 + 1000.0 * np.sin(0.1)], abs=1.0)
+    sigma_x, sigma_y = (np.sqrt(found.detections[f"cov_{axis}_m2"].to_numpy()[0]) for axis in ("xx", "yy"))
+    assert sigma_x == pytest.approx(5.0, abs=0.3) and sigma_y == pytest.approx(995.0 * np.radians(2.0), rel=0.01)
+
+
+def test_own_poses_need_a_sensor(tmp_path: Path) -> None:
+    source = FINDER | {"observer": "{sensor}"}
+    fails(tmp_path, finders(), ConfigError, "12 of its messages name no sensor", detections=[source])
+
+
 def test_without_a_pose_near_in_time_it_is_left_out_and_counted(tmp_path: Path) -> None:
     boat = [fix(2.0 * i, 50.0, -1.0, "/boat/fix") for i in range(3)]
     source = FINDER | {"bearing_convention": "compass", "observer": "boat", "agent": "fox"}
