@@ -109,7 +109,8 @@ def _chosen(plan: Plan, number: int, found: Filtered, drawing: Tensor, later: _L
             earlier = found.model.view(num_rows, h)[:, own]
             passes = chains.passes(number + 1, earlier)[:, None].expand(-1, len(drawn), -1, -1)
             passed = passes.gather(3, model[:, :, None, None].expand(-1, -1, len(own), 1))[..., 0].log()
-            density = plan.members[index].temper * log_density.at(own, state, model)
+            # where the next stretch begins is drawn, not estimated: it counts in full, whatever the likelihood does
+            density = log_density.at(own, state, model)
             score = score + torch.where(is_last, 0.0, passed + density)
         edges = torch.softmax(score, dim=-1).cumsum(-1)
         at = torch.searchsorted(edges, uniform[:, drawn, None] * edges[..., -1:], right=True)[..., 0]
