@@ -63,6 +63,9 @@ LONG_STEPS = 16.0
 """Gaps longer than that in which a random moment lies are long ones."""
 
 
+_LONG = f"over {LONG_STEPS:.0f} steps"
+
+
 @dataclass(frozen=True, eq=False)
 class Prepared:
     """A log, what its estimators are fitted to, and the steps that count.
@@ -250,6 +253,8 @@ def rows_of(found: dict[tuple[str, int], list[dict[str, dict[str, object]]]]) ->
             for name in (WINDOWS, MISSION)
         }
         for gap, is_in in _by_gap(column[MISSION]["gap"]):
+            if not is_in.any():
+                continue
             rng = np.random.default_rng(0)
             mission, windows = ({key: value[is_in] for key, value in column[name].items()} for name in (MISSION, WINDOWS))
             row = {"log": log, "detections_percent": percent, "gaps": gap, "num_cells": int(is_in.sum())}
@@ -270,7 +275,7 @@ def rows_of(found: dict[tuple[str, int], list[dict[str, dict[str, object]]]]) ->
 
 def _by_gap(gap: Float64s) -> Iterator[tuple[str, Bools]]:
     yield "all", np.ones(len(gap), dtype=bool)
-    yield f"over {LONG_STEPS:.0f} steps", gap > LONG_STEPS
+    yield _LONG, gap > LONG_STEPS
     yield f"over {4 * LONG_STEPS:.0f} steps", gap > 4 * LONG_STEPS
 
 
@@ -302,7 +307,7 @@ def section(measured_: Measurement) -> str:
             publishing.interval(row, "ratio", ".2f"), publishing.interval(row, "mission_in_90", ".2f"),
             publishing.interval(row, "windows_in_90", ".2f"), str(row["num_cells"]),
         ]
-        for row in measured_.rows() if row["num_cells"]
+        for row in measured_.rows() if row["gaps"] in ("all", _LONG)
     ]  # fmt: skip
     return publishing.table(heads, lines)
 

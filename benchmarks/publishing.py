@@ -28,6 +28,7 @@ DOCS = Path(__file__).resolve().parents[1] / "docs"
 PAGES = {
     "real_logs": ("real_logs",),
     "answers": ("reliability",),
+    "mission": ("mission",),
     "worlds": ("worlds",),
     "forecasts": ("table1", "table1_paper"),
     "forecast_limits": ("training_seeds", "narco_ceiling", "library_draws", "place_ablations"),

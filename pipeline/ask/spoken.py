@@ -16,7 +16,10 @@ from pipeline.ask.words import area_words
 from pipeline.lengths import metres
 
 _MANY = 20
-_UNPROVEN = "Mission hypotheses may be too sure where gaps are long; `cadence evaluate` says how sure, where there is truth."
+_UNPROVEN = (
+    "On measured logs 90 % regions of mission hypotheses held 71 to 98 % of the truth; `cadence evaluate` says it of this log, "
+    "where there is truth."
+)
 
 
 def ask(directory: Path, question: Question, out: Path | None = None, as_json: bool = False) -> str:
