@@ -497,9 +497,16 @@ def same(
 
 
 @questions.command()
-def searched(context: typer.Context, as_json: Json = False) -> None:
-    """How much of where it may have been the sensors swept; not answered yet."""
-    _answer(context, as_json, ask="searched")
+def searched(
+    context: typer.Context,
+    start: From = None,
+    end: To = None,
+    agent: OneAgent = None,
+    as_of: AsOf = None,
+    as_json: Json = False,
+) -> None:
+    """How much of where it may have been the sensors swept, and where one more look would have paid most."""
+    _answer(context, as_json, ask="searched", start=start, end=end, agent=agent, as_of=as_of)
 
 
 @app.command()

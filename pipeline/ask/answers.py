@@ -17,6 +17,7 @@ from pipeline.ask.known import Known
 from pipeline.ask.parts import part_words
 from pipeline.ask.question import Question
 from pipeline.ask.sameness import same
+from pipeline.ask.sweeps import sweep_words
 from pipeline.ask.words import (
     area_words,
     moment_words,
@@ -69,7 +70,7 @@ def answers(known: Known, question: Question) -> tuple[Answer, ...]:
     if question.ask == "meet":
         return tuple(_meet(known, question))
     agents = range(len(known.stories.agent_ids)) if question.agent is None else [known.agent(question.agent)]
-    ask = {"where": _where, "inside": _inside, "arrive": _arrive, "passed": _passed}[question.ask]
+    ask = {"where": _where, "inside": _inside, "arrive": _arrive, "passed": _passed, "searched": _searched}[question.ask]
     found = [ask(known, question, agent) for agent in agents]
     return tuple(sorted((each for each in found if each is not None), key=_rank)) or _nobody(known, question)
 
@@ -78,12 +79,11 @@ def refuse_unanswerable(directory: Path, question: Question) -> None:
     """`InputError` where no results of the log could answer the question."""
     if question.ask != "searched":
         return
-    if (directory / SENSORS_NAME).is_file():
+    if not (directory / SENSORS_NAME).is_file():
         raise InputError(
-            f"{directory}: how much the sensors searched is not answered yet; the report's maps show what they covered, "
-            "and where they saw nothing weighs the hypotheses of windows"
+            f"{directory}: the log states no footprints of its sensors, so that nobody can say what was searched; "
+            "state them in [[extract.sensors]]"
         )
-    raise InputError(f"{directory}: the log states no footprints of its sensors, so that nobody can say what was searched")
 
 
 def _rank(answer: Answer) -> tuple[float, tuple[str, ...]]:
@@ -178,6 +178,12 @@ def _passed(known: Known, question: Question, agent: int) -> Answer:
         "line_length_m": line.length_m,
     }  # fmt: skip
     return _answer(known, question, (name,), "; ".join(words), found.passed, found.passed_s, span, told)
+
+
+def _searched(known: Known, question: Question, agent: int) -> Answer:
+    span = known.span(question.start, question.end)
+    words, found, told = sweep_words(known, agent, span, _during(known, question, span))
+    return _answer(known, question, (known.stories.agent_ids[agent],), words, found.success, None, span, told)
 
 
 def _meet(known: Known, question: Question) -> Iterator[Answer]:

@@ -8,13 +8,14 @@ import pyarrow as pa
 import pytest
 import shapely
 from fixtures.asked import asked_mission
-from fixtures.mission import GEOREFERENCED, START_NS
+from fixtures.mission import FRAME, GEOREFERENCED, START_NS
 from PIL import Image
 
 import cli
 from cadence.errors import UsageError
 from pipeline import Question, open_mission
 from pipeline.frames import to_geodetic
+from pipeline.looks import Footprint, LookRows, write_looks
 from pipeline.tables import read_table, write_table
 
 SQUARE = json.dumps({"type": "Polygon", "coordinates": [[[-100, -50], [100, -50], [100, 50], [-100, 50], [-100, -50]]]})
@@ -251,11 +252,26 @@ def test_files_are_for_where_only(directory, tmp_path):
         spoken(directory, Question("inside", area="mast"), tmp_path)
 
 
-def test_footprints_alone_do_not_say_what_was_searched(placed, capsys):
-    sensors = placed / "sensors.json"
-    sensors.write_text("{}", encoding="utf-8")
-    try:
-        got, out, err = ask(capsys, placed, "searched")
-    finally:
-        sensors.unlink()
-    assert got == 3 and not out and "is not answered yet" in err and "no footprints" not in err
+def test_what_was_searched_in_words_and_numbers(tmp_path, capsys):
+    """A mast at 0, 0 sees 200 m far with 50 % where T0 passes in three of four stories; its looks miss, but for one of T1."""
+    mission = asked_mission(tmp_path)
+    rows = LookRows(
+        START_NS + np.array([60, 100, 100], dtype=np.int64) * 10**9, ["mast"] * 3, np.zeros(3, dtype=np.int64),
+        np.zeros(3, dtype=np.int64), np.zeros((3, 2)), np.zeros(3), [frozenset(), frozenset(), frozenset({"T1"})],
+    )  # fmt: skip
+    write_looks(mission, "patrol", rows, [Footprint("mast", (((0.0, 0.5), (200.0, 0.5)),), is_standing=True)], FRAME)
+    first, second = sorted(told(capsys, mission, "searched"), key=lambda answer: answer["agents"])
+    # two looks at T0 near the mast in 150 of 200 stories, of which .3 counts; the other look was too early
+    assert first["num_looks"] == 3 and first["success"]["value"] == pytest.approx(0.75 * (1 - 0.5**0.6))
+    assert second["num_looks"] == 2 and second["success"]["value"] == pytest.approx(1 - 0.5**0.3)
+    assert first["success_by"][0] == 0.0 and first["success_by"] == sorted(first["success_by"])
+    # at the end T0 is at 1000, 0 in the stories that were searched, and at -1000, 0 in those that were not
+    left = 0.75 * 0.5**0.6
+    assert first["next_look"]["sensor"] == "mast" and first["next_look"]["place_m"] == [1000.0, 0.0]
+    assert first["next_look"]["success"] == pytest.approx(0.5 * left / (left + 0.25))
+    code, out, _ = ask(capsys, mission, "searched", "--agent", "T0", "--from", "90", "--to", "110")
+    assert code == 0 and out.startswith(
+        "2 looks between 22:14:50 and 22:15:10 did not see T0, and would have with 26 % (20 to 32 %)"
+    )
+    code, out, err = ask(capsys, mission, "searched", "--from", "110")
+    assert code == 3 and not out and "no sensor looked between 22:15:10" in err
