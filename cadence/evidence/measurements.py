@@ -215,5 +215,6 @@ def _columns() -> list[str]:
 
 def _about_their_mean(apart: Float64s, turn: Float64s) -> Float64s:
     """Deviations [K, M] of angles, brought to within half a turn of their mean direction, of which one turn is `turn` [M]."""
-    angle = np.angle(np.exp(2j * math.pi * apart / turn).mean(axis=0)) / (2.0 * math.pi) * turn
+    # divided before it is complex: numpy warns of complex NaN, which stands for no angle, and of no real one
+    angle = np.angle(np.exp(1j * (2.0 * math.pi * apart / turn)).mean(axis=0)) / (2.0 * math.pi) * turn
     return np.asarray(angle + np.remainder(apart - angle + 0.5 * turn, turn) - 0.5 * turn, dtype=np.float64)

@@ -216,10 +216,11 @@ def _check_any(role: str, rows: Positions, counts: Counter[str], suspicions: Sus
 def _check_drawable(rows: Mapping[str, Positions], suspicions: Suspicions) -> None:
     """`InputError` where nothing but bearings, or ranges, tells of anybody."""
     num = len(rows[SIGHTINGS]) // rows[SIGHTINGS].PLACES
-    if num and not len(rows["detections"]) and not suspicions:
+    if num and not len(rows["detections"]):
+        doubted = f"; suspected {'; '.join(few(suspicions.lines()))}" if suspicions else ""
         raise InputError(
             f"{counted(num, 'measurement is', 'measurements are')} bearings or ranges alone, and no detection is a position: "
-            "from those alone no agent can be drawn yet; add a source of positions, or of ranges with bearings"
+            f"from those alone no agent can be drawn yet; add a source of positions, or of ranges with bearings{doubted}"
         )
 
 

@@ -115,6 +115,13 @@ def test_what_no_track_reaches_is_told_and_set_aside():
     assert WithEvidence(Walk()).sample(windows(behind), 30).status == ((CONTRADICTED,),)
 
 
+def test_columns_without_an_angle_warn_of_nothing():
+    ranges = measured([0.0, 10.0], range_m=100.0, bearing_sigma_rad=math.nan, elevation_sigma_rad=math.nan)
+    paths = tracks([(100.0, 0.0)] * 3, [(90.0, 0.0)] * 3)
+    with np.errstate(all="raise"):
+        assert ranges.contradicts(paths, ranges.log_likelihood(paths)).tolist() == [[False]]
+
+
 def test_two_ranges_with_two_modes_agrees_with_a_grid():
     """A ring about an observer and the same range from another: two places, weighed as the prior says."""
     at_m = np.array([[-3.0, 1.0], [3.0, 1.0]])

@@ -170,6 +170,12 @@ def test_bearings_alone_are_told_to_draw_nobody(tmp_path: Path) -> None:
     )
 
 
+def test_a_doubted_unit_does_not_hide_that_bearings_draw_nobody(tmp_path: Path) -> None:
+    rows = [heard(float(i), bearing=40.0 * i) for i in range(8)]
+    words = r"8 measurements are bearings or ranges alone, .*; suspected place of /finder: .* read as degrees"
+    fails(tmp_path, rows, InputError, words, detections=[FINDER])
+
+
 def test_a_sensor_that_nothing_joins_is_refused(tmp_path: Path) -> None:
     message = {"header": {"stamp": stamp(1.0), "frame_id": "mast"}, "bearing": 0.1}
     rows = [*detected(), Row("/finder", "own.Heard", 1.0, message)]
