@@ -20,8 +20,8 @@ ADVICE = {
     "no_detections": "not detected within this window's history; infer.grid.history_steps or step_s would widen it",
     "infeasible": "no way between detections keeps all limits; check obstacles and infer.guidance (margin_m, max_...)",
     "scarce": "hardly a draw keeps all limits, so these are narrower than what is known; check obstacles and infer.guidance",
-    CONTRADICTED: "what else is known (silence of sensors, ...) speaks against every track and was left out here; check the "
-    "sensors' footprints and clocks, or whether the target is another one",
+    CONTRADICTED: "what else is known (silence of sensors, bearings, ...) speaks against every track and was left out here; "
+    "check the sensors' footprints and clocks, how their bearings count, or whether the target is another one",
     FEW_FIT: "hardly any track fits what else is known, so these few may miss the target; a larger infer.evidence.most_draws "
     "or infer.num_hypotheses draws more",
     "guidance_diverged": "sampling did not stay finite, so the bank's samples stand in; report this log",

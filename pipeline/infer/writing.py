@@ -1,20 +1,21 @@
 """A mission's detections to the tables of hypotheses and windows: all that costs something when the stage runs."""
 
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from cadence.evidence.estimator import CONTRADICTED, FEW_FIT
 from pipeline.checkpoints import checkpoint_hash
 from pipeline.counted import counted
 from pipeline.estimators.presets import find_weights
 from pipeline.infer.config import InferConfig
 from pipeline.infer.draws import Drawn
 from pipeline.infer.plan import Beside, Plan
-from pipeline.infer.rows import hypothesis_rows, window_rows, with_association, with_effective
+from pipeline.infer.rows import ADVICE, hypothesis_rows, window_rows, with_association, with_effective
 from pipeline.looks import read_looks
 from pipeline.measurements import read_measurements
 from pipeline.obstacle_file import OBSTACLES_NAME, read_obstacles
@@ -59,7 +60,7 @@ def write_tables(
     return {
         **summary,
         "step_s": plan.seen.sources.grid.step_s,
-        "remarks": [*plan.seen.sources.grid.remarks, *plan.found],
+        "remarks": [*plan.seen.sources.grid.remarks, *plan.found, *_set_aside(summary["status"])],
         "context_steps": plan.seen.sources.grid.context_steps,
         "checkpoint": plan.checkpoint,
         "checkpoint_sha256": _hash(plan.checkpoint),
@@ -67,6 +68,15 @@ def write_tables(
         **plan.about,
         "suspicions": plan.suspicions.records(),
     }
+
+
+def _set_aside(status: Mapping[str, int]) -> list[str]:
+    """What to tell where evidence was set aside in most windows in which it could be weighed: a source is misread, likely."""
+    num = status.get(CONTRADICTED, 0)
+    num_weighed = num + status.get(FEW_FIT, 0) + status.get("ok", 0)
+    if 2 * num <= num_weighed:
+        return []
+    return [f"in {num} of {num_weighed} pairs of a window and an agent {ADVICE[CONTRADICTED]}"]
 
 
 def _hash(checkpoint: str) -> str | None:

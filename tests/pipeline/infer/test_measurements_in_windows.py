@@ -18,19 +18,22 @@ MIDDLE = np.array([3.0 * 106.0, 40.0 * np.sin(0.02 * 106.0) + 15.0])
 """Where T0 is said to have been at 106 s, on the way from 94 to 120 s on which nobody saw it."""
 
 
-def with_bearings(directory: Path, agents: tuple[str | None, ...] = ("T0",), sigma_rad: float = 0.002) -> Path:
+def with_bearings(
+    directory: Path, agents: tuple[str | None, ...] = ("T0",), sigma_rad: float = 0.002, at_s: float | np.ndarray = 106.0,
+    turned_rad: float = 0.0,
+) -> Path:  # fmt: skip
     """A mast in the west that hears somebody at 106 s, each of `agents` once."""
     num = len(agents)
     nothing = np.full(num, np.nan)
     east, north = MIDDLE - MAST
     rows = MeasurementRows(
-        time_ns=np.full(num, START_NS + 106 * 10**9),
+        time_ns=START_NS + np.full(num, np.multiply(at_s, 1e9)).astype(np.int64),
         sensor=np.array(["mast"] * num, dtype=object),
         agent=np.array(agents, dtype=object),
         observer_m=np.tile([*MAST, np.nan], (num, 1)),
         observer_velocity_mps=np.zeros((num, 2)),
         range_m=nothing,
-        bearing_rad=np.full(num, np.arctan2(north, east)),
+        bearing_rad=np.full(num, np.arctan2(north, east) + turned_rad),
         elevation_rad=nothing,
         range_rate_mps=nothing,
         range_sigma_m=nothing,
@@ -70,6 +73,13 @@ def test_a_bearing_pulls_the_way_that_nobody_saw(tmp_path: Path) -> None:
     summary = inferred(heard)
     assert summary["measurements"] == {"num_used": 1, "num_not_used": 0, "agents": {"T0": 1}}
     assert miss_m(heard) < 0.6 * miss_m(plain)
+
+
+def test_bearings_that_are_set_aside_in_most_windows_are_told(tmp_path: Path) -> None:
+    misread = with_bearings(mission(tmp_path), ("T0", "T1") * 100, at_s=np.arange(200.0), turned_rad=-np.pi)
+    summary = inferred(misread)
+    assert 2 * summary["status"]["contradicted"] > sum(summary["status"].values())
+    assert "how their bearings count" in summary["remarks"][-1]
 
 
 def test_whom_nobody_can_draw_is_said(tmp_path: Path) -> None:
