@@ -35,7 +35,7 @@ def tell(counts: Counter[str], suspicions: Suspicions, detections: Positions, lo
         "other_frame": "positions are in another frame than the detections, which no transform joins, and were skipped",
         "no_transform": "positions have no transform near enough in time (see extract.max_extrapolation_s) and were skipped",
         "static": "returns stand, by the Doppler of their scans, and were left out (see is_static_used of a source)",
-        "no_observer": "positions have no pose of their observer near enough in time and were skipped",
+        "no_observer": "measurements have no pose of their observer near enough in time and were skipped",
         "outside_time_cut": "messages lie outside extract.start and extract.end and were not used",
         "unselected_topics": "topics fit none of extract.topics and were not used",
     }
