@@ -10,6 +10,7 @@ how good they are. Where few do, what all samples miss is taken for outliers and
 likelihood, and then ranges are spaced more finely. That what fits well may yet be an outlier is not sought.
 """
 
+import dataclasses
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -22,14 +23,17 @@ from cadence.bank.smoother import Backward, Nodes, backward_kernel, draw
 from cadence.bearings.cells import Cells, Prior, Problem, first_cells, refined
 from cadence.bearings.linear import Sights, turned
 from cadence.bearings.profiles import supposed_tracks
-from cadence.resampling import effective_number, systematic
+from cadence.resampling import effective_number, resample, systematic
 
-_MOST_CELLS = 256
+_MOST_MODELS = 8
+_MOST_CELLS = 1024
 _LEAST_SIZE = 10.0
 """Cells so much smaller than the largest, as logarithms, are left out."""
 _NUM_REFINED = 3
 _ENOUGH = 0.1
 """Of the samples that are to count; below it other cells are tried."""
+_TOLD = 0.5
+"""Power of the first sizes by which models are drawn, as these are rough."""
 _COARSE, _FINE = 1.8, 1.35
 _MOST_TRIES = 4
 _MOST_DEVIATIONS = 3.5
@@ -102,7 +106,8 @@ def _sampled(
     sights = known.sights[is_used]
     profiles = supposed_tracks(sights, known.nearest_m, known.farthest_m, ratio)
     problem = Problem(known.prior, known.detections, sights, profiles)
-    cells = _largest(first_cells(problem, known.begin_s))
+    cells, prior = _few_models(first_cells(problem, known.begin_s), known.prior, float(generator.random()))
+    problem, cells = dataclasses.replace(problem, prior=prior), _largest(cells)
     for _ in range(_NUM_REFINED):
         cells = _largest(refined(problem, cells, known.begin_s))
     parts_s = (time_s, known.sights.time_s, sights.time_s, sights.time_s[profiles.anchor_row])
@@ -121,6 +126,23 @@ def _sampled(
     cloud = Cloud(state[:, asked], cells.model[owner], weight, log_evidence, effective_number(weight.numpy()))
     missed = torch.softmax(_DAMPED * log_weight, 0) @ _is_missed(known.sights, state[:, seen, :2]).double()
     return cloud, missed > 0.5
+
+
+def _few_models(cells: Cells, prior: Prior, uniform: float) -> tuple[Cells, Prior]:
+    """The cells of a few models, drawn by what they may explain, and a prior that is right in expectation.
+
+    To leave out the smallest cells of all models instead would take away from the far ends of what bearings allow (measured).
+    """
+    num_models = len(prior.log_weight)
+    size = torch.full((num_models, len(cells) // num_models), -torch.inf, dtype=torch.float64)
+    size[cells.model, cells.profile] = cells.log_size
+    chance = torch.softmax(_TOLD * size.logsumexp(1), 0)
+    chosen, weight = resample(chance.numpy(), _MOST_MODELS, uniform)
+    log_weight = torch.full_like(prior.log_weight, -torch.inf)
+    log_weight[chosen] = prior.log_weight[chosen] + torch.from_numpy(weight).log() - chance[chosen].log()
+    cells = cells[torch.isin(cells.model, torch.from_numpy(chosen))]
+    more = (log_weight - prior.log_weight)[cells.model]
+    return dataclasses.replace(cells, log_size=cells.log_size + more), dataclasses.replace(prior, log_weight=log_weight)
 
 
 def _largest(cells: Cells) -> Cells:

@@ -2,6 +2,10 @@
 
 Drawing and weighing ends where measurements are sharp: no draw of a prior fits thirty bearings. There, and where an agent has
 no position at all, joint samples come from the bank's steady models, given positions and measurements together.
+
+Not calibrated yet for one observer. Of 60 targets drawn from the sampler's own prior (20 steady models, one observer with one
+turn, 30 bearings of 1.5 degrees, no position) 13 were refused, and the 90 % region held 79, 87 and 85 % of the other 47 at the
+first, middle and last bearing. Those refused are not chance ones, so that this says little of all targets. No stage uses it.
 """
 
 import dataclasses
@@ -37,7 +41,8 @@ _MOST_FORGOTTEN = 0.1
 """Per step: tracks that forget their velocity faster may be at too many ranges on every bearing."""
 _LEAST_WEIGHT, _MOST_MODELS = 0.01, 24
 _MOST_MEASUREMENTS = 400
-_LEAST_EFFECTIVE = 20.0
+_LEAST_SHARE = 0.1
+"""Of the samples that must count. Below it what bearings allow is not all reached, though nothing shows it (measured)."""
 _NEAREST, _FARTHEST = 0.005, 3.0
 
 
@@ -144,7 +149,7 @@ class WithBearings:
             said = hear(rest, whole).apart[0, :, agent].numpy()
             weight = weight * np.exp(said - said.max())
         num_effective = min(cloud.num_effective, effective_number(weight))
-        if num_effective < _LEAST_EFFECTIVE:
+        if cloud.num_effective < _LEAST_SHARE * self.num_drawn:
             return None
         index = generator.permutation(systematic(weight, num, float(generator.random())))
         return track_m[torch.from_numpy(index)], min(num_effective, float(num))
