@@ -56,7 +56,7 @@ def plan_clouds(
     fixes = (
         _chosen([num * _FIX_BYTES for num in num_fixes], _FIXES_SHARE * hypothesis_bytes) if is_georeferenced else frozenset()
     )
-    # For one message without fixes Rerun 0.41 drops the whole file (findings/fixes.sh).
+    # A message says where somebody is: where nobody is, there is none.
     return CloudPlan(clouds, frozenset(index for index in fixes if num_fixes[index]))
 
 
