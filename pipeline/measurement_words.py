@@ -24,4 +24,4 @@ def measurement_words(record: Mapping[str, Any]) -> str:
     nameless = record["num"] - sum(record["agents"].values())
     shown = [*about[:_MAX_NAMED], *([f"{len(about) - _MAX_NAMED} more"] if len(about) > _MAX_NAMED else [])]
     shown += [f"nobody knows whom ({nameless})"] if nameless else []
-    return f"{kinds} of {', '.join(record['topics'])}, which are no positions, weigh windows; about {', '.join(shown)}"
+    return f"{kinds} of {', '.join(record['topics'])}, which are no positions, may weigh windows; about {', '.join(shown)}"

@@ -57,7 +57,7 @@ def test_compass_bearings_from_a_place(tmp_path: Path) -> None:
         "agents": {"fox": 8},
     }  # fmt: skip
     assert found.summary["num_detections"] == 5 and found.summary["suspicions"] == []
-    told = "8 bearings of /finder, which are no positions, weigh windows; about fox (8)"
+    told = "8 bearings of /finder, which are no positions, may weigh windows; about fox (8)"
     assert measurement_words(found.summary["measurements"]) == told and measurement_words({}) == ""
 
 

@@ -24,7 +24,7 @@ def log(folder: Path) -> Path:
 def test_doctor_tells_bearings_and_finds_nothing_wrong(tmp_path: Path) -> None:
     found = diagnose([log(tmp_path)], Progress(quiet=True))
     assert exit_code([found]) == 0
-    assert "  5 bearings of /bearings, which are no positions, weigh windows; about fox (5)" in render(found)
+    assert "  5 bearings of /bearings, which are no positions, may weigh windows; about fox (5)" in render(found)
 
 
 def test_info_has_lines_for_them(tmp_path: Path) -> None:
@@ -35,6 +35,6 @@ def test_the_report_counts_them_once(tmp_path: Path) -> None:
     summary = dict(diagnose([log(tmp_path)], Progress(quiet=True)).use)
     rows = _extraction(summary)
     (row,) = [words for title, words in rows if title == "bearings and ranges"]
-    assert row == "5 bearings of /bearings, which are no positions, weigh windows; about fox (5)"
+    assert row == "5 bearings of /bearings, which are no positions, may weigh windows; about fox (5)"
     assert not [title for title, _ in rows if title.startswith("measurements")]
     assert not [title for title, _ in _extraction({}) if title == "bearings and ranges"]
