@@ -4,9 +4,10 @@ import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import typer
+from typer.core import TyperGroup
 
 from cadence.errors import CadenceError, DeviceError, PartialInputError, UsageError
 from pipeline.batch.summaries import batch_summary, log_record, stage_exit_code, stage_summary, to_json
@@ -387,8 +388,19 @@ def evaluate(
     _show(evaluate_any(mission, checkpoint, out, resolved, Progress(quiet), force), as_json)
 
 
+class _OneMission(TyperGroup):
+    """Where a pattern of the shell made several words of the mission, the second one is no question."""
+
+    def resolve_command(self, ctx: typer.Context, args: list[str]) -> Any:  # type: ignore[override]
+        """The question; `UsageError` where it is a path."""
+        if Path(args[0]).exists() and args[0] not in self.commands:
+            raise UsageError(f"ask is about one mission: give one folder, not {ctx.params.get('mission')} and {args[0]}")
+        return super().resolve_command(ctx, args)
+
+
 questions = typer.Typer(
     name="ask",
+    cls=_OneMission,
     add_completion=False,
     rich_markup_mode=None,
     no_args_is_help=True,
@@ -473,11 +485,12 @@ def meet(
     agents: Annotated[list[str] | None, typer.Argument(metavar="A B", help="Two agents; default: all pairs.")] = None,
     within: Annotated[float, typer.Option("--within", metavar="M", help="Metres.", show_default=False)] = ...,  # type: ignore[assignment]
     during: Annotated[float, typer.Option("--for", metavar="S", help="Seconds without a break.")] = 0.0,
+    every: Annotated[bool, typer.Option("--all", help="All pairs, as without names.")] = False,
     start: From = None, end: To = None, as_of: AsOf = None, as_json: Json = False,
 ) -> None:  # fmt: skip
     """Whether two came within M metres of each other, when and where."""
     one, other = [*(agents or ()), None, None][:2]
-    if len(agents or ()) > 2:
+    if len(agents or ()) > 2 or (agents and every):
         raise UsageError("meet is about two agents, or about all")
     _answer(
         context, as_json, ask="meet", agent=one, other=other, within_m=within, for_s=during, start=start, end=end, as_of=as_of

@@ -213,7 +213,9 @@ CROSSED = feature([-1.2, 50.8], [-1.1, 50.9], [-1.1, 50.8], [-1.2, 50.9], [-1.2,
         (["same", "T0", "#3"], "not one of each", 2),
         (["same", "#0", "#99999"], "no row of detections.parquet", 2),
         (["searched"], "states no footprints", 3),
+        (["meet", "T0", "--all", "--within", "5"], "about two agents, or about all", 2),
         (["nonsense"], "No such command 'nonsense'", 2),
+        (["/", "where", "--at", "50"], "ask is about one mission: give one folder", 2),
     ],
 )  # fmt: skip
 def test_bad_input_is_one_clear_line(placed, words, says, code, capsys):
