@@ -20,9 +20,9 @@ def answers_section(mission: Mission, boxes: Sequence[Mapping[str, Any]], events
     if events:
         rows = [_row(mission, clock, event) for event in events]
         heads = ("from", "to", "what", "how likely", "in words", "")
-        content += f"<h3>Events</h3>{table(heads, rows[:_OPEN_ROWS])}"
+        content += f"<h3>Events</h3>{table(heads, rows[:_OPEN_ROWS], kind='events')}"
         if len(rows) > _OPEN_ROWS:
-            rest = table(heads, rows[_OPEN_ROWS:_MAX_ROWS])
+            rest = table(heads, rows[_OPEN_ROWS:_MAX_ROWS], kind="events")
             content += f"<details><summary>{len(rows) - _OPEN_ROWS:,} more events</summary>{rest}</details>"
     lead = "From mission hypotheses, which know all that was detected. events.csv says how to compute each event again."
     return section("Answers", content, lead)
