@@ -13,9 +13,10 @@ import numpy as np
 import pyarrow as pa
 
 from cadence.arrays import Float64s, Int64s
+from cadence.constraints.obstacles import Obstacles
 from cadence.errors import InputError
 from cadence.evidence.footprints import Area, DetectionCurve, Polygon, Sector
-from cadence.evidence.silence import Looks
+from cadence.evidence.silence import Looks, Silence
 from pipeline.documents import parse_json
 from pipeline.look_files import LOOKS_NAME, SENSORS_NAME
 from pipeline.tables import Frame, read_table, write_table
@@ -142,6 +143,18 @@ def read_looks(directory: Path, start_ns: int) -> tuple[tuple[Footprint, Looks],
             )  # fmt: skip
             found.append((footprint, looks))
     return tuple(found)
+
+
+def silences(
+    looks: Sequence[tuple[Footprint, Looks]], obstacles: Obstacles, exponent: float
+) -> tuple[tuple[Footprint, ...], tuple[Silence, ...]]:
+    """The silence of looks by whether obstacles hide from them, and the footprints of all their looks in that order."""
+    ordered = sorted(looks, key=lambda each: each[0].is_hidden)
+    parts = []
+    for is_hidden, hiding in ((False, Obstacles.none()), (True, obstacles)):
+        if own := tuple(some for footprint, some in ordered if footprint.is_hidden == is_hidden):
+            parts.append(Silence(own, exponent, obstacles=hiding))
+    return tuple(footprint for footprint, _ in ordered), tuple(parts)
 
 
 def _tuples(value: Any) -> Any:

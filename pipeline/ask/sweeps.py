@@ -5,14 +5,13 @@ from typing import Any
 
 from cadence.answers.estimates import Probability
 from cadence.answers.sweeps import Sweep, swept
-from cadence.constraints.obstacles import Obstacles
 from cadence.errors import InputError
 from cadence.evidence.exponents import SAFE
 from cadence.evidence.silence import Silence
 from pipeline.ask.known import Known
 from pipeline.ask.words import numbers, percent, place_words
 from pipeline.counted import counted
-from pipeline.looks import Footprint, read_looks
+from pipeline.looks import Footprint, read_looks, silences
 from pipeline.manifest import read_manifest
 from pipeline.obstacle_file import OBSTACLES_NAME, read_obstacles
 
@@ -56,18 +55,11 @@ def _percent(found: Probability) -> str:
 
 
 def _parts(known: Known) -> tuple[Sequence[Footprint], tuple[Silence, ...]]:
-    """The footprint of every kind of looks, and the looks by whether obstacles hide from them, believed as by infer."""
+    """The footprint of every kind of looks, and the looks: believed as by infer, with caution where that left silence out."""
     about = ((read_manifest("infer", known.directory) or {}).get("summary") or {}).get("silence") or {}
     exponent = float(about.get("exponent") or SAFE)
     looks = read_looks(known.directory, known.start_ns)
-    footprints: list[Footprint] = []
-    parts: list[Silence] = []
-    for is_hidden in (False, True):
-        own = [(footprint, some) for footprint, some in looks if footprint.is_hidden == is_hidden]
-        if own:
-            obstacles = read_obstacles(known.directory / OBSTACLES_NAME) if is_hidden else Obstacles.none()
-            parts.append(Silence(tuple(some for _, some in own), exponent, obstacles=obstacles))
-            footprints += [footprint for footprint, _ in own]
+    footprints, parts = silences(looks, read_obstacles(known.directory / OBSTACLES_NAME), exponent)
     if not parts:
         raise InputError(f"{known.directory}: no sensor looked anywhere; see [[extract.sensors]] in docs/configuration.md")
-    return footprints, tuple(parts)
+    return footprints, parts

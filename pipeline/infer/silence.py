@@ -12,7 +12,7 @@ from cadence.evidence.exponents import SAFE, ChosenExponent, choose_exponent
 from cadence.evidence.settings import WeighingConfig
 from cadence.evidence.silence import Looks, Silence
 from cadence.types import Estimator, Evidence
-from pipeline.looks import Footprint
+from pipeline.looks import Footprint, silences
 from pipeline.windows import MissionWindows
 
 _NUM_TESTED = 40
@@ -50,11 +50,7 @@ def hear_silence(
     remarks = []
     if len(heard) < len(looks):
         remarks.append("silence of sensors that stand is left out: this checkpoint has learned it with its tracks")
-    parts = [
-        Silence(tuple(some for footprint, some in heard if footprint.is_hidden == is_hidden), SAFE, obstacles=hiding)
-        for is_hidden, hiding in ((False, Obstacles.none()), (True, obstacles))
-        if any(footprint.is_hidden == is_hidden for footprint, _ in heard)
-    ]
+    _, parts = silences(heard, obstacles, SAFE)
     if not parts:
         return HeardSilence(remarks=tuple(remarks))
     if config.exponent is None:
@@ -64,7 +60,7 @@ def hear_silence(
     if chosen.exponent == 0.0:
         why = "hypotheses weighed by it foresee withheld detections worse" if config.exponent is None else "it is set so"
         remarks.append(f"silence of sensors is not used: {why} (infer.evidence.exponent)")
-        parts = []
+        parts = ()
     evidence = tuple(Silence(part.looks, chosen.exponent, obstacles=part.obstacles) for part in parts)
     about = {
         "exponent": chosen.exponent,
