@@ -22,6 +22,7 @@ CONTRADICTED, FEW_FIT = "contradicted", "few_fit"
 
 _FEWEST = 0.1
 _MARGIN = 1.5
+"""So many times what is missed is drawn: the effective number of more draws is a guess."""
 _MOST_NUMBERS = 8_000_000
 """Coordinates drawn at once where more hypotheses are drawn: 64 MB."""
 

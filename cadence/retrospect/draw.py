@@ -20,7 +20,7 @@ from cadence.bank.bank import Bank
 from cadence.bank.mixture import merge_grid
 from cadence.bank.pool import BankPool, shared_out
 from cadence.bank.smoother import Backward, backward_kernel, filter_from
-from cadence.retrospect.filtering import Filtered, Plan, Tracks
+from cadence.retrospect.filtering import Filtered, Plan, Tracks, spread_uniform
 from cadence.retrospect.timeline import Timeline
 from cadence.seeds import derived_seeds
 
@@ -96,7 +96,7 @@ def _chosen(plan: Plan, number: int, found: Filtered, drawing: Tensor, later: _L
     """The particle [R K] of each hypothesis in a stretch, drawn given what it does in the next one."""
     num_rows, h, k = len(plan.tracks), plan.num_particles, len(drawing)
     pair = torch.empty(num_rows, k, dtype=torch.int64)
-    uniform = _spread_uniform(plan, number, k)
+    uniform = spread_uniform(plan.tracks.seeds, "choice", k, number)
     is_last = (plan.last.view(num_rows, h)[:, 0] <= number)[:, None, None]
     log_density = None if later is None else _Density.of(plan, found)
     for index, chains in plan.chains.items():
@@ -116,16 +116,6 @@ def _chosen(plan: Plan, number: int, found: Filtered, drawing: Tensor, later: _L
         at = torch.searchsorted(edges, uniform[:, drawn, None] * edges[..., -1:], right=True)[..., 0]
         pair[:, drawn] = own[at.clamp(max=len(own) - 1)] + h * torch.arange(num_rows)[:, None]
     return pair.flatten()
-
-
-def _spread_uniform(plan: Plan, number: int, num_hypotheses: int) -> Tensor:
-    """Uniform numbers [R, K], each row's own, evenly spread over hypotheses in random order."""
-    rows = []
-    for seed in derived_seeds(plan.tracks.seeds.numpy(), "choice", number).tolist():
-        generator = torch.Generator().manual_seed(seed)
-        order = torch.rand(num_hypotheses, generator=generator, dtype=torch.float64).argsort()
-        rows.append((order.double() + torch.rand(1, generator=generator, dtype=torch.float64)) / num_hypotheses)
-    return torch.stack(rows)
 
 
 @dataclass(frozen=True, eq=False)

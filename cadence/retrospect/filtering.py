@@ -176,7 +176,7 @@ class Plan:
         num_rows, h = len(self.tracks), self.num_particles
         model = torch.zeros(num_rows, h, dtype=torch.int64)
         log_weight = torch.zeros(num_rows, h, dtype=torch.float64)
-        uniform = _spread_numbers(self.tracks.seeds, h, stretch)
+        uniform = spread_uniform(self.tracks.seeds, "chains", h, stretch)
         has_begun = (self.first.view(num_rows, h)[:, 0] < stretch)[:, None]
         for index, chains in self.chains.items():
             own = self.member == index
@@ -265,10 +265,10 @@ def _entered(models: MotionModels, is_kept: Tensor, mean: Tensor, covariance: Te
     return torch.where(is_kept[:, None], mean, new_mean), torch.where(is_kept[:, None, None], covariance, new_covariance)
 
 
-def _spread_numbers(seeds: Tensor, num: int, stretch: int) -> Tensor:
-    """Uniform numbers [R, H] of a stretch, each row's own, evenly spread."""
+def spread_uniform(seeds: Tensor, purpose: str, num: int, stretch: int) -> Tensor:
+    """Uniform numbers [R, N] of a stretch for a purpose, each row's own, evenly spread in random order; seeds are [R]."""
     rows = []
-    for seed in derived_seeds(seeds.numpy(), "chains", stretch).tolist():
+    for seed in derived_seeds(seeds.numpy(), purpose, stretch).tolist():
         generator = torch.Generator().manual_seed(seed)
         order = torch.rand(num, generator=generator, dtype=torch.float64).argsort()
         rows.append((order.double() + torch.rand(1, generator=generator, dtype=torch.float64)) / num)

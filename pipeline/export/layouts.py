@@ -124,9 +124,8 @@ def _scene_config(frame: Frame, style: Style, source: Sequence[CatalogueChannel]
     for channel in (channels.SCENE, channels.PRESENT, channels.OBSTACLES, channels.OCCUPANCY):
         if channel.topic in topics:
             shown[channel.topic] = {"visible": True}
-    if (
-        channels.MISSION_SCENE.topic in topics
-    ):  # whole lines, given everything: over the windows' they would hide what was known when
+    # Whole lines, given everything: over the windows' they would hide what was known when.
+    if channels.MISSION_SCENE.topic in topics:
         shown[channels.MISSION_SCENE.topic] = {"visible": False}
     if channels.OCCUPANCY.topic in topics:
         shown[channels.OCCUPANCY.topic] |= {"colorMode": "rgba-fields", "colorField": "probability", "frameLocked": True}

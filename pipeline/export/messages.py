@@ -80,10 +80,8 @@ def encode_mission(mission: MissionStories, agent: int, number: int, time_ns: in
     """cadence.MissionHypotheses of an agent in the block with this number; None where it is part of no story there."""
     block, stories = mission.blocks[number], mission.stories
     steps = slice(block.first, block.stop)
-    position_m, height_m = (
-        stories.position_m[:, agent, steps],
-        None if stories.height_m is None else stories.height_m[:, agent, steps],
-    )
+    position_m = stories.position_m[:, agent, steps]
+    height_m = None if stories.height_m is None else stories.height_m[:, agent, steps]
     is_there = np.isfinite(position_m[..., 0])
     if not is_there.any():
         return None
