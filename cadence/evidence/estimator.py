@@ -21,8 +21,6 @@ CONTRADICTED, FEW_FIT = "contradicted", "few_fit"
 """Statuses: evidence that speaks against every track was set aside; hardly any track fits what the evidence says."""
 
 _FEWEST = 0.1
-_MARGIN = 1.5
-"""So many times what is missed is drawn: the effective number of more draws is a guess."""
 _MOST_NUMBERS = 8_000_000
 """Coordinates drawn at once where more hypotheses are drawn: 64 MB."""
 
@@ -64,17 +62,14 @@ class WithEvidence:
         if not bool(said.is_touched.any()):
             return self._cut(found)
         weighed = self._chosen(found, said, asked, num_hypotheses)
-        missing = ENOUGH * num_hypotheses / _least_effective(found, said, asked, self.is_apart)
-        factor = _factors(torch.where(said.is_touched, missing, 0.0), self.config.most_draws)
-        for many in sorted(set(factor.tolist()) - {1}):
-            weighed = self._drawn_more(weighed, asked, factor == many, many, num_hypotheses)
+        is_short = said.is_touched & (_least_effective(found, said, asked, self.is_apart) < ENOUGH * num_hypotheses)
+        if bool(is_short.any()) and self.config.most_draws > 1:
+            weighed = self._drawn_more(weighed, asked, is_short, num_hypotheses)
         return self._cut(_with_few(weighed, num_hypotheses))
 
-    def _drawn_more(
-        self, weighed: HypothesisSet, windows: WindowBatch, is_short: Tensor, factor: int, num: int
-    ) -> HypothesisSet:
-        """The windows that are short of hypotheses, chosen from `factor` times as many draws."""
-        num_drawn = factor * num
+    def _drawn_more(self, weighed: HypothesisSet, windows: WindowBatch, is_short: Tensor, num: int) -> HypothesisSet:
+        """The windows that are short of hypotheses, chosen from many more draws."""
+        num_drawn = self.config.most_draws * num
         at_once = max(1, _MOST_NUMBERS // (2 * num_drawn * windows.num_agents * windows.num_steps))
         for some in torch.split(is_short.nonzero()[:, 0], at_once):
             part = windows[some]
@@ -158,15 +153,6 @@ def _least_effective(found: HypothesisSet, said: Said, windows: WindowBatch, is_
     by_agent = effective(torch.softmax(log_weight, 1).transpose(1, 2))
     is_asked = windows.is_active if by_agent.shape[1] > 1 else torch.ones_like(by_agent, dtype=torch.bool)
     return torch.where(is_asked, by_agent, torch.inf).amin(1)
-
-
-def _factors(missing: Tensor, most: int) -> Tensor:
-    """How many times as many are to be drawn [B]: 1 where enough count already (`missing` [B] of 1 or less).
-
-    So many count as are drawn, half as many again to be sure; in powers of two, so that windows are drawn together.
-    """
-    wanted = torch.exp2(torch.ceil(torch.log2(_MARGIN * missing.clamp_min(1.0)))).clamp(max=most)
-    return torch.where(missing > 1.0, wanted, 1.0).to(torch.int64)
 
 
 def _put(whole: HypothesisSet, rows: Tensor, part: HypothesisSet) -> HypothesisSet:
