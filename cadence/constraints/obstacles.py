@@ -4,7 +4,8 @@ Distances and gradients are analytic and finite everywhere. Circles are torch ar
 index of their edges on the CPU, so that a polygon of thousands of vertices (a coast, an occupancy grid) costs little.
 """
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -143,6 +144,12 @@ class ObstacleConstraint:
         hinge, gradient = self._hinge(position_m.detach())
         return -hinge[..., None] * gradient
 
+    def at(self, chosen: Tensor) -> "ObstacleConstraint":
+        """The constraint on the chosen positions [N, 2] alone, of all [...] that it is on."""
+        if self.offset_m is None:
+            return self
+        return replace(self, offset_m=self.offset_m.expand(*chosen.shape, 2)[chosen])
+
     def _hinge(self, position_m: Tensor) -> tuple[Tensor, Tensor]:
         distance, gradient = self.obstacles.signed_distance(position_m, offset_m=self.offset_m, limit_m=self.margin_m)
         return (self.margin_m - distance).clamp_min(0), gradient
@@ -191,20 +198,34 @@ def _merge_polygons(position_m: Tensor, obstacles: Obstacles, limit_m: float, di
     point = position_m.detach().cpu().numpy()
     best, slope = distance.cpu().numpy().copy(), gradient.cpu().numpy().copy()
     is_free = np.isfinite(point).all(axis=1) & _may_be_near(point, shapely.bounds(obstacles.shapes), limit_m)
-    index, polygon = obstacles.tree.query(shapely.points(point[is_free]))
-    index = np.flatnonzero(is_free)[index]
-    inside = shapely.contains_xy(obstacles.shapes[polygon], point[index, 0], point[index, 1])
-    index, polygon = index[inside], polygon[inside]
-    for number in np.unique(polygon).tolist():
-        its = index[polygon == number]
+    inside = list(_inside(point, np.flatnonzero(is_free), obstacles))
+    for number, its in inside:
         _lower(best, slope, its, *obstacles._edges(number).nearest(point[its], sign=-1.0))
-    is_free[index] = False
+    for _, its in inside:
+        is_free[its] = False
     if limit_m > 0:
         outside = np.flatnonzero(is_free & (best > 0))
         near = obstacles._all_edges.near(point[outside], limit_m)
         _lower(best, slope, outside[near], *obstacles._all_edges.nearest(point[outside[near]], sign=1.0))
     distance.copy_(torch.from_numpy(best))
     gradient.copy_(torch.from_numpy(slope))
+
+
+def _inside(point: Float64s, index: Indices, obstacles: Obstacles) -> Iterator[tuple[int, Indices]]:
+    """Of the points [N, 2] at `index` those inside each polygon that holds any, by the polygon's number."""
+    if len(obstacles.shapes) > _FEW_POLYGONS:
+        near, polygon = obstacles.tree.query(shapely.points(point[index]))
+        found = index[near]
+        holds = shapely.contains_xy(obstacles.shapes[polygon], point[found, 0], point[found, 1])
+        found, polygon = found[holds], polygon[holds]
+        yield from ((number, found[polygon == number]) for number in np.unique(polygon).tolist())
+        return
+    x, y = point[index].T.copy()
+    for number, (west, south, east, north) in enumerate(shapely.bounds(obstacles.shapes)):
+        near = np.flatnonzero((x >= west) & (x <= east) & (y >= south) & (y <= north))
+        near = near[shapely.contains_xy(obstacles.shapes[number], x[near], y[near])]
+        if len(near):
+            yield number, index[near]
 
 
 def _may_be_near(point: Float64s, boxes: Float64s, limit_m: float) -> Bools:

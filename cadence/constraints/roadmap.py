@@ -5,7 +5,7 @@ their waypoints are corners of the `outline` (a little larger), so that rounding
 """
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -27,7 +27,10 @@ _REACHES = (1.0, 4.0, 32.0)
 """Where no route is found near the components in the way, one is sought farther out."""
 MAX_CORNERS = 24
 """The most corners of one route."""
-_CHUNK = 20_000_000
+_CHUNK = 4_000_000
+"""Ways over a corner that are compared at once."""
+_FEW_SHAPES = 64
+"""Up to here, comparing boxes one shape after the other is quicker than a search tree."""
 
 
 @dataclass(frozen=True)
@@ -85,23 +88,29 @@ class Zone:
     def hits(self, start: Float64s, end: Float64s) -> Indices:
         """For segments from start to end [N, 2], a component of the outline in the way [N]; -1 where the core is clear."""
         found = np.full(len(start), -1)
-        segment, part = self.core.touching(shapely.linestrings(np.stack([start, end], axis=1)))
-        found[segment] = self._outline_of_core[part]
+        near = self.core.may_touch(np.minimum(start, end), np.maximum(start, end))
+        segment, part = self.core.touching(shapely.linestrings(np.stack([start[near], end[near]], axis=1)))
+        found[near[segment]] = self._outline_of_core[part]
         return found
 
     def blocks(self, start: Float64s, end: Float64s) -> Bools:
         """Whether the core touches segments from start to end [..., 2]; the quick form of `hits`."""
-        blocked: Bools = shapely.intersects(self._whole, shapely.linestrings(np.stack([start, end], axis=-2)))
+        blocked = np.zeros(start.shape[:-1], dtype=bool)
+        start, end = start.reshape(-1, 2), end.reshape(-1, 2)
+        near = self.core.may_touch(np.minimum(start, end), np.maximum(start, end))
+        lines = shapely.linestrings(np.stack([start[near], end[near]], axis=1))
+        blocked.reshape(-1)[near] = shapely.intersects(self._whole, lines)
         return blocked
 
     def regions(self, point: Float64s) -> Indices:
         """The region of free space of points [N, 2]: 0 outside everything, 1 + hole inside a hole, -1 in the core."""
-        points = shapely.points(point)
         region = np.zeros(len(point), dtype=np.intp)
+        near = self.core.may_touch(point, point)  # holes lie in the core's boxes as well
+        points = shapely.points(point[near])
         index, hole = self.holes.touching(points)
         order = np.argsort(hole, kind="stable")
-        region[index[order]] = 1 + hole[order]
-        region[self.core.touching(points)[0]] = -1
+        region[near[index[order]]] = 1 + hole[order]
+        region[near[self.core.touching(points)[0]]] = -1
         return region
 
     def exits(self, point: Float64s, region: int) -> Float64s | None:
@@ -244,6 +253,19 @@ class _Index:
         shapely.prepare(shapes)
         self.tree = shapely.STRtree(shapes)
 
+    def may_touch(self, low: Float64s, high: Float64s) -> Indices:
+        """Which boxes from low to high [N, 2] meet the box of a shape: a quick look, before geometry is made of them.
+
+        All of them where there are many shapes: then the search tree is quicker.
+        """
+        if len(self.shapes) > _FEW_SHAPES:
+            return np.arange(len(low))
+        is_near = np.zeros(len(low), dtype=bool)
+        (x_low, y_low), (x_high, y_high) = low.T, high.T
+        for west, south, east, north in shapely.bounds(self.shapes):
+            is_near |= (x_low <= east) & (x_high >= west) & (y_low <= north) & (y_high >= south)
+        return np.flatnonzero(is_near)
+
     def touching(self, geometry: Objects) -> tuple[Indices, Indices]:
         """All pairs (index into geometry, index into shapes) that touch."""
         query, shape = self.tree.query(geometry)
@@ -254,10 +276,14 @@ class _Index:
 
 @dataclass(frozen=True, eq=False)
 class _Graph:
-    """Bends [V, 3, 2]: corners of routes between their neighbours on the outline; lengths [V, V] of free segments, else inf."""
+    """Bends [V, 3, 2]: corners of routes between their neighbours on the outline; lengths [V, V] of free segments, else inf.
+
+    from_end holds the same from ends of routes that were asked for to all corners: they are often asked for again.
+    """
 
     bends: Float64s
     length: Float64s
+    from_end: dict[tuple[float, float], Float64s] = field(default_factory=dict)
 
     @property
     def corners(self) -> Float64s:
@@ -277,10 +303,7 @@ class _Graph:
     def search(self, zone: Zone, requests: Sequence[Request]) -> list[Float64s | None]:
         """The shortest route of every request."""
         start, end = np.stack([r.start for r in requests]), np.stack([r.end for r in requests])
-        ends = []
-        for point in (start, end):
-            shape = (len(point), len(self.bends), 2)
-            ends.append(_free_lengths(zone, np.broadcast_to(point[:, None], shape), np.broadcast_to(self.corners, shape)))
+        ends = self._to_corners(zone, start), self._to_corners(zone, end)
         direct = _free_lengths(zone, start, end)
         routes: list[Float64s | None] = [None] * len(requests)
         free = [index for index, request in enumerate(requests) if request.barrier is None]
@@ -302,13 +325,23 @@ class _Graph:
                 routes[index] = self._shortest([request], *one)[0]
         return routes
 
+    def _to_corners(self, zone: Zone, point: Float64s) -> Float64s:
+        """Lengths [R, V] of the segments from points [R, 2] to all corners; infinite where the core is in the way."""
+        keys = list(map(tuple, point.tolist()))
+        new = list(dict.fromkeys(key for key in keys if key not in self.from_end))
+        if new:
+            shape = (len(new), len(self.bends), 2)
+            begin = np.broadcast_to(np.array(new)[:, None], shape)
+            self.from_end.update(zip(new, _free_lengths(zone, begin, np.broadcast_to(self.corners, shape)), strict=True))
+        return np.stack([self.from_end[key] for key in keys])
+
     def _shortest(
         self, requests: Sequence[Request], best: Float64s, first: Float64s, last: Float64s, between: Float64s
     ) -> list[Float64s | None]:
         """Shortest paths by dynamic programming over the number of corners: best [R] holds the straight ways."""
         hop = np.array([r.hop_cost_m for r in requests])[:, None]
         allowed = np.array([r.max_waypoints for r in requests])
-        row = np.arange(len(requests))
+        row, to_corner = np.arange(len(requests)), np.ascontiguousarray(between.T)
         hops, corner = np.zeros_like(allowed), np.zeros_like(allowed)
         reach, came_from = first + hop, []
         for level in range(1, min(int(allowed.max()), MAX_CORNERS) + 1):
@@ -319,9 +352,14 @@ class _Graph:
             is_better = total[row, candidate] < best
             best = np.where(is_better, total[row, candidate], best)
             hops, corner = np.where(is_better, level, hops), np.where(is_better, candidate, corner)
-            through = reach[:, :, None] + between
-            came_from.append(through.argmin(axis=1))
-            reach = through.min(axis=1) + hop
+            # where every corner is farther than the best way is long, further corners lead nowhere
+            useful = np.flatnonzero((reach.min(axis=1) < best) & (allowed > level))
+            through = reach[useful, None, :] + to_corner
+            before = np.zeros(reach.shape, dtype=np.intp)
+            before[useful] = through.argmin(axis=2)
+            came_from.append(before)
+            reach = np.full_like(reach, np.inf)
+            reach[useful] = np.take_along_axis(through, before[useful][..., None], 2)[..., 0] + hop[useful]
         routes: list[Float64s | None] = []
         for index in row:
             chain = [int(corner[index])] if hops[index] else []

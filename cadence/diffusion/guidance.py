@@ -12,7 +12,7 @@ from torch import Tensor
 
 from cadence.constraints import Constraint
 from cadence.constraints.motion import step_lengths
-from cadence.constraints.obstacles import Obstacles
+from cadence.constraints.obstacles import ObstacleConstraint, Obstacles
 
 
 def adam_guidance(mean: Tensor, cost_fn: Callable[[Tensor], Tensor], lr: float = 1e-2, iterations: int = 8) -> Tensor:
@@ -73,6 +73,14 @@ def clean_estimate_guidance(
     Every step is s² / (s² + g²) of the violation g: all of a violation that is small against the uncertainty,
     never more than strength · s / 2. Steps whose sigma allows it converge to feasible.
     """
+    if len(constraints) == 1 and isinstance(constraints[0], ObstacleConstraint) and num_steps > 1:
+        # of obstacles each position knows by itself: what lies clear of them stays, and need not be looked at again
+        moved = clean_estimate_guidance(position_m, constraints, scale_m, 1, strength)
+        is_moved = (moved != position_m).any(dim=-1)
+        own = constraints[0].at(is_moved)
+        scale_m = scale_m.expand(*is_moved.shape, 1)[is_moved]
+        moved[is_moved] = clean_estimate_guidance(moved[is_moved], [own], scale_m, num_steps - 1, strength)
+        return moved
     variance = scale_m.square()
     for _ in range(num_steps):
         gradient = torch.zeros_like(position_m)
