@@ -7,7 +7,7 @@ each other, with every member drawn once.
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -98,15 +98,30 @@ def settings_of(bank: Bank) -> tuple[Bank, ...]:
     )
 
 
-def pool_by_hindsight(bank: Bank, past: Test, future: Test) -> BankPool:
-    """The bank's settings pooled by how they fill gaps, and by how they go on; safe weights where too little can be tested."""
+def pool_by_hindsight(bank: Bank, past: Test, future: Test | None) -> BankPool:
+    """The bank's settings pooled by how they fill gaps, and by how they go on; safe weights where too little can be tested.
+
+    Without a `future` nothing is drawn after the last detection, and nothing tested.
+    """
     members = settings_of(bank)
     if bank.log_weight is None:
         return BankPool(members[:1], torch.ones(1).double(), torch.ones(1).double())
     # Gaps are filled whatever happens after the last detection, and there is nothing to test.
     fixed = [dataclasses.replace(member, switch_rate=0.0) for member in members]
     weight_past = best_weights(_found(fixed, _up_to_origin(past[0]), past[1]), _SAFE)
-    return BankPool(members, weight_past, best_weights(_found(members, *future), _SAFE))
+    return BankPool(members, weight_past, best_weights(None if future is None else _found(members, *future), _SAFE))
+
+
+def pool_as_told(bank: Bank, about: Mapping[str, object]) -> BankPool | None:
+    """A fitted bank's settings pooled as what `BankPool.about` said of them before; None where that is of other settings."""
+    members = settings_of(bank) if bank.log_weight is not None else (bank,)
+    weights, names = [], SETTINGS[: len(members)]
+    for part in ("past", "future"):
+        shares = about.get(part)
+        if not isinstance(shares, dict) or set(shares) != set(names):
+            return None
+        weights.append(torch.tensor([shares[name] for name in names], dtype=torch.float64))
+    return BankPool(members, weights[0], weights[1])
 
 
 def _up_to_origin(windows: WindowBatch) -> WindowBatch:

@@ -5,8 +5,9 @@ Given the detections, height is independent of the plane: a hypothesis is a draw
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -102,9 +103,17 @@ class HeightBank:
         drawn: Float64s = found.transpose(0, 1).numpy()
         return drawn
 
-    def about(self) -> dict[str, float | int | None]:
+    def about(self) -> dict[str, Any]:
         """What a summary says of it."""
-        return {"rate_mps": self.rate_mps, "num_modes": len(self.modes)}
+        return {"rate_mps": self.rate_mps, "num_modes": len(self.modes), "log_weight": self._log_weight().tolist()}
+
+    def as_told(self, about: Mapping[str, Any], step_s: float) -> "HeightBank | None":
+        """The bank as what `about` said of it once fitted, for the same step; None where that is of another bank."""
+        rate_mps, log_weight = about.get("rate_mps"), about.get("log_weight")
+        if not isinstance(rate_mps, float) or not isinstance(log_weight, list) or len(log_weight) != len(self.modes):
+            return None
+        weight = torch.tensor(log_weight, dtype=torch.float64)
+        return dataclasses.replace(self, rate_mps=rate_mps, step_s=step_s, log_weight=weight)
 
     def _floored(self, rows: Nodes) -> Nodes:
         return dataclasses.replace(rows, variance_m2=rows.variance_m2 + (FLOOR_STEPS * self._length_m) ** 2)

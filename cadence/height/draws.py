@@ -205,16 +205,17 @@ def _law(source: State, to: Steps) -> list[Tensor]:
 
 def _log_density(law: Tensor, later: Drawn) -> Tensor:
     """Log weight and density of the later samples under Gaussians before a step."""
-    z, v, vv, twice_zv, zz, determinant, log_determinant, log_weight = law[:8]
+    z, v, vv, twice_zv, zz, determinant, log_determinant, log_weight = law[:8].unbind()
     dz, dv = later.z - z, later.v - v
     distance = (vv * dz**2 - twice_zv * dz * dv + zz * dv**2) / determinant
-    return log_weight - 0.5 * (distance + log_determinant)
+    found: Tensor = log_weight - 0.5 * (distance + log_determinant)
+    return found
 
 
 def _given_later(law: Tensor, later: Drawn, normal: Tensor) -> tuple[Tensor, Tensor]:
     """Height and rate [R, K] before a step drawn given the samples after it."""
     dz, dv = later.z - law[0], later.v - law[1]
-    z, v, gain_zz, gain_zv, gain_vz, gain_vv, *pair = law[8:17]
+    z, v, gain_zz, gain_zv, gain_vz, gain_vv, *pair = law[8:17].unbind()
     draws = _Pair(*pair)
     z = z + gain_zz * dz + gain_zv * dv
     return z + draws.deviation * normal[..., 0], draws.rate(v + gain_vz * dz + gain_vv * dv, normal)

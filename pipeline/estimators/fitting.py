@@ -3,7 +3,9 @@
 import dataclasses
 import functools
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -12,7 +14,7 @@ from torch import Tensor
 
 from cadence.bank.bank import Bank
 from cadence.bank.hindsight import Test, withhold
-from cadence.bank.pool import BankPool, pool_by_hindsight
+from cadence.bank.pool import BankPool, pool_as_told, pool_by_hindsight
 from cadence.height.bank import HeightBank
 from cadence.types import Detections, WindowBatch
 from pipeline.grids import Grid
@@ -41,9 +43,15 @@ class FittingData:
         """The data with its stretches cut."""
         return FittingData(detections, grid, windows, fit_tracks(detections, grid, default_sigma_m), default_sigma_m)
 
-    def fitted_heights(self) -> HeightBank:
-        """The bank of height fitted to the log, which has heights."""
-        return HeightBank().fit(self.tracks, self.grid.step_s)
+    def fitted_heights(self, told: Mapping[str, Any] | None = None) -> HeightBank:
+        """The bank of height fitted to the log, which has heights; as is `told` of the same log and grid, if it is."""
+        found = None if told is None else HeightBank().as_told(told, self.grid.step_s)
+        return found or HeightBank().fit(self.tracks, self.grid.step_s)
+
+    def bank_for_gaps(self, told: Mapping[str, Any] | None) -> BankPool:
+        """The bank fitted to the log, pooled as is `told` of the same log and grid, else by hindsight for gaps alone."""
+        pool = None if told is None else pool_as_told(self._bank, told)
+        return pool or pool_by_hindsight(self._bank, self._past_test, None)
 
     def fitted_bank(self) -> BankPool:
         """The bank fitted to the log: weights by likelihood, its settings pooled by hindsight."""
@@ -51,7 +59,11 @@ class FittingData:
 
     @functools.cached_property
     def _pool(self) -> BankPool:
-        return pool_by_hindsight(Bank().fit(self.tracks, self.grid.step_s), *self.tests)
+        return pool_by_hindsight(self._bank, *self.tests)
+
+    @functools.cached_property
+    def _bank(self) -> Bank:
+        return Bank().fit(self.tracks, self.grid.step_s)
 
     @functools.cached_property
     def tests(self) -> tuple[Test, Test]:
@@ -59,12 +71,16 @@ class FittingData:
 
         Every row is one agent's window; where the log has few windows, others between them join.
         """
-        windows = self._many_windows()
+        windows = self._many_windows
         grid = dataclasses.replace(self.grid, origins_ns=windows.origins_ns)
         later = later_detections(self.detections, grid, windows, self.default_sigma_m)
-        kept, withheld = withhold(windows.batch, 0)
         is_later = windows.batch.is_active & later.is_observed.any(-1)
-        return _rows(kept, withheld, withheld.is_observed.any(-1)), _rows(windows.batch, later, is_later)
+        return self._past_test, _rows(windows.batch, later, is_later)
+
+    @property
+    def _past_test(self) -> Test:
+        kept, withheld = withhold(self._many_windows.batch, 0)
+        return _rows(kept, withheld, withheld.is_observed.any(-1))
 
     @property
     def gate_tests(self) -> tuple[Test, Test]:
@@ -73,6 +89,7 @@ class FittingData:
         past, future = (_some(*test, num) for test in self.tests)
         return past, future
 
+    @functools.cached_property
     def _many_windows(self) -> MissionWindows:
         """The windows, or so many between them that they hold enough agents to test on."""
         num = int(self.windows.batch.is_active.sum())

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pyarrow as pa
@@ -40,6 +40,7 @@ class MissionSources:
 
     named   the likeliest agent of each, as models of motion are fitted to them
     shares  which track each agent has in which stories; an agent is no part of stories that none names
+    is_grid_of_windows  the grid is that of infer's windows, so that what infer found of the bank holds on it
     """
 
     told: Told
@@ -50,6 +51,7 @@ class MissionSources:
     grid: Grid
     agent_ids: tuple[str, ...]
     shares: tuple[Share, ...]
+    is_grid_of_windows: bool = False
 
     @staticmethod
     def read(directory: Path, num_stories: int, seed: int) -> "MissionSources":
@@ -59,9 +61,14 @@ class MissionSources:
         origins_ns = np.unique(read_table(directory / "windows.parquet", "windows")[0]["origin_ns"].to_numpy())
         association = read_pasts(directory, detections, origins_ns, told.default_sigma_m)
         named = detections if association is None else association.named(detections)
-        grid = _grid(named, told, summary, origins_ns)
+        grid, is_same = _grid(named, told, summary, origins_ns)
         agent_ids, shares = _shares(detections, association, told.default_sigma_m, num_stories, seed)
-        return MissionSources(told, summary, frame, str(detections["log_id"][0]), named, grid, agent_ids, shares)
+        return MissionSources(told, summary, frame, str(detections["log_id"][0]), named, grid, agent_ids, shares, is_same)
+
+    def told_of(self, name: Literal["bank", "height"]) -> Mapping[str, Any] | None:
+        """What infer says of a bank that it fitted to the same detections on the same grid, if it did."""
+        found = self.summary.get(name) if self.is_grid_of_windows else None
+        return found if isinstance(found, dict) else None
 
     def fitting(self, seed: int) -> FittingData:
         """What models are fitted to, as in infer."""
@@ -69,13 +76,13 @@ class MissionSources:
         return FittingData.of(self.named, self.grid, build_windows(self.named, self.grid, seed, sigma_m), sigma_m)
 
 
-def _grid(named: pa.Table, told: Told, summary: Mapping[str, Any], origins_ns: Int64s) -> Grid:
-    """The grid of the windows; where it is that of a place model, which sees no history, one that fits the detections."""
+def _grid(named: pa.Table, told: Told, summary: Mapping[str, Any], origins_ns: Int64s) -> tuple[Grid, bool]:
+    """The grid of the windows, and that it is; where it is that of a place model, which sees no history, one that fits."""
     config = load_estimator(str(summary.get("checkpoint", told.checkpoint)), Samplings()).grid(told.grid)
     if config.history_steps < _LEAST_HISTORY:
-        return plan_grid(named, GridConfig())
+        return plan_grid(named, GridConfig()), False
     step_ns = round(float(summary["step_s"]) * 1e9)
-    return Grid(step_ns, config.history_steps, config.horizon_steps, origins_ns, summary.get("context_steps"))
+    return Grid(step_ns, config.history_steps, config.horizon_steps, origins_ns, summary.get("context_steps")), True
 
 
 def _shares(

@@ -60,7 +60,9 @@ def drawn_stories(
     weight = np.full(config.num_hypotheses, 1.0 / config.num_hypotheses)
     time_s, start_ns, height = draw.timeline.time_s.numpy(), int(timing.time_ns[0]), None
     if data.tracks.height_m is not None:
-        height = heights_beside(data.fitted_heights(), sources.shares, position, time_s, start_ns, config.seed)
+        height = heights_beside(
+            data.fitted_heights(sources.told_of("height")), sources.shares, position, time_s, start_ns, config.seed
+        )
     stories = Stories(time_s, position, weight, sources.agent_ids, height)
     mission = MissionStories(sources.frame, sources.log_id, start_ns, stories, timing.blocks)
     return mission, {
@@ -72,7 +74,7 @@ def drawn_stories(
         "duration_s": float(stories.time_s[-1]),
         "replaced_share": num_replaced / max(num_tracks, 1),
         "plausible_speed_mps": draw.limits.plausible_speed_mps,
-        "bank": draw.pool.about(),
+        "bank": {name: value for name, value in draw.pool.about().items() if name != "future"},
         "remarks": [*timing.remarks, *_remarks(sources)],
     }
 
@@ -89,7 +91,7 @@ def _mission_draw(
     sources: MissionSources, data: FittingData, timing: Timing, config: RetrospectConfig, obstacles: Obstacles
 ) -> MissionDraw:
     guidance, step_s = sources.told.guidance, sources.grid.step_s
-    pool: BankPool = data.fitted_bank()
+    pool: BankPool = data.bank_for_gaps(sources.told_of("bank"))
     datum_m: Float64s = np.round(np.concatenate([share.track.position_m for share in sources.shares]).mean(axis=0))
     is_free = guidance.mode == "none"
     limits = MissionLimits(

@@ -1,6 +1,7 @@
 """The pool: weights of least energy score, shrunk by doubt; hypotheses shared out; past and future from different members."""
 
 import dataclasses
+import json
 
 import pytest
 import torch
@@ -9,7 +10,7 @@ from fixtures.bank import as_tracks, random_windows, simulate
 from cadence.bank.bank import Bank
 from cadence.bank.components import home_ranges
 from cadence.bank.hindsight import withhold
-from cadence.bank.pool import SETTINGS, BankPool, best_weights, pool_by_hindsight, settings_of, shared_out
+from cadence.bank.pool import SETTINGS, BankPool, best_weights, pool_as_told, pool_by_hindsight, settings_of, shared_out
 from cadence.types import Detections, WindowBatch
 
 WINDOWS = random_windows(num_windows=6)
@@ -88,3 +89,12 @@ def test_targets_that_stay_about_a_place_are_drawn_with_a_home() -> None:
 def test_a_bank_without_weights_is_not_pooled() -> None:
     bank = Bank(speed_mps=1.0)
     assert pool_by_hindsight(bank, withhold(WINDOWS, 0), withhold(WINDOWS, 0)).members[0].log_weight is None
+
+
+def test_a_pool_is_what_it_said_of_itself_and_nothing_else() -> None:
+    weight = torch.tensor([0.1, 0.2, 0.3, 0.4, 0.0], dtype=torch.float64)
+    pool = BankPool(settings_of(BANK), weight, weight.flip(0))
+    again = pool_as_told(BANK, json.loads(json.dumps(pool.about())))
+    assert again is not None and torch.equal(again.weight_past, weight) and torch.equal(again.weight_future, weight.flip(0))
+    assert pool_as_told(BANK, {"past": {"exact": 1.0}, "future": {"exact": 1.0}}) is None
+    assert pool_as_told(BANK, {}) is None

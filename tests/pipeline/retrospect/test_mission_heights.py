@@ -1,5 +1,7 @@
 """Mission hypotheses of a log with heights: they are drawn beside the plane, for agents that have any."""
 
+import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -7,6 +9,7 @@ import pyarrow as pa
 import pytest
 from test_retrospect import DETECTED_S, INFER, QUIET, detections, run
 
+from pipeline.files import hash_file
 from pipeline.infer.stage import infer
 from pipeline.stories import MISSION_NAME, read_stories
 from pipeline.tables import Frame, read_table, write_table
@@ -48,6 +51,19 @@ def test_heights_are_where_the_agent_is_and_as_they_were_seen(high: Path) -> Non
     at = np.searchsorted(stories.time_s, seen_s - 0.5)
     off_m = stories.height_m[:, 0, at] - (1000.0 + 2.0 * seen_s)
     assert np.abs(off_m.mean(axis=0)).max() < 4.0
+
+
+def test_what_infer_fitted_is_what_would_be_fitted_again(high: Path, tmp_path: Path) -> None:
+    """Models are handed on by infer's manifest; where it says nothing of them they are fitted to the same."""
+    alone = tmp_path / "walk"
+    shutil.copytree(high, alone)
+    told = json.loads((alone / "infer.manifest.json").read_text())
+    assert {"bank", "height"} <= set(told["summary"])
+    del told["summary"]["bank"], told["summary"]["height"]
+    (alone / "infer.manifest.json").write_text(json.dumps(told))
+    (alone / "retrospect.manifest.json").unlink()
+    assert run(alone).status == "done"
+    assert hash_file(alone / MISSION_NAME) == hash_file(high / MISSION_NAME)
 
 
 def test_the_plane_keeps_its_numbers_and_a_log_without_heights_its_bytes(high: Path, tmp_path: Path) -> None:
