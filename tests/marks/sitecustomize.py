@@ -1,0 +1,5 @@
+"""Python runs this at each start while this folder is on PYTHONPATH."""
+
+from line_marks import install
+
+install()
