@@ -277,28 +277,32 @@ def _interval(gospas: Sequence[Float64s]) -> Interval:
     return bootstrap_mean(values, groups, np.random.default_rng(0))
 
 
+LIKELY = 0.5
+"""Shown is how often attributions come true that are at least so probable; all are in the table."""
+
+
 def section(measured: Measurement) -> str:
     """Both cases, and how often what is said of a detection comes true."""
-    parts = []
-    for case in measured.rows("cases"):
-        lines = []
-        for row in measured.rows(case=case["case"]):
-            numbers = [f"{row[name]:.0f}" for name in ("missed_m", "false_m")]
-            others = [row[name] for name in ("labels_percent", "energy_m")]
-            numbers += ["–" if value is None else f"{value:.0f}" for value in others]
-            lines.append([row["estimator"], publishing.interval(row, "gospa_m", ".0f"), *numbers])
-        title = f"{case['case']} ({case['num_logs']} {'log' if case['num_logs'] == 1 else 'logs'})"
-        heads = [title, "GOSPA, m", "missed, m", "false, m", "labels, %", "energy, m"]
-        parts.append(publishing.table(heads, lines))
-    names = [case["case"] for case in measured.rows("cases")]
-    bins = list(dict.fromkeys((row["said_from"], row["said_to"]) for row in measured.rows("told")))
+    cases = measured.rows("cases")
+    lines = []
+    for estimator in dict.fromkeys(row["estimator"] for row in measured.rows()):
+        line = [estimator]
+        for case in cases:
+            rows = measured.rows(case=case["case"], estimator=estimator)
+            labels = rows[0]["labels_percent"] if rows else None
+            line += [publishing.interval(rows[0], "gospa_m", ".0f") if rows else "–", "–" if labels is None else f"{labels:.0f}"]
+        lines.append(line)
+    logs = [f"{case['case']} ({case['num_logs']} {'log' if case['num_logs'] == 1 else 'logs'})" for case in cases]
+    scores = publishing.table(["GOSPA, m; labels, %", *(head for log in logs for head in (log, "labels"))], lines)
+    names = [case["case"] for case in cases]
+    bins = dict.fromkeys((row["said_from"], row["said_to"]) for row in measured.rows("told") if row["said_from"] >= LIKELY)
     lines = []
     for low, high in bins:
         found = [measured.rows("told", case=name, said_from=low, said_to=high) for name in names]
         cells = [f"{rows[0]['came_true']:.2f} of {rows[0]['num_cases']}" if rows else "–" for rows in found]
         lines.append([f"{low:g} to {high:g}", *cells])
     heads = ["said: P(detection → agent)", *(f"{name}: came true" for name in names)]
-    return "\n\n".join([*parts, publishing.table(heads, lines)])
+    return f"{scores}\n\n{publishing.table(heads, lines)}"
 
 
 def main() -> int:
