@@ -290,7 +290,10 @@ def section(measured: Measurement) -> str:
         for case in cases:
             rows = measured.rows(case=case["case"], estimator=estimator)
             labels = rows[0]["labels_percent"] if rows else None
-            line += [publishing.interval(rows[0], "gospa_m", ".0f") if rows else "–", "–" if labels is None else f"{labels:.0f}"]
+            line += [
+                publishing.interval(rows[0], "gospa_m", ".0f") if rows else "–",
+                "–" if labels is None else f"{labels:.0f}",
+            ]
         lines.append(line)
     logs = [f"{case['case']} ({case['num_logs']} {'log' if case['num_logs'] == 1 else 'logs'})" for case in cases]
     scores = publishing.table(["GOSPA, m; labels, %", *(head for log in logs for head in (log, "labels"))], lines)

@@ -54,14 +54,9 @@ def main() -> None:
 
 
 def section(measured: Measurement) -> str:
-    """Times over that of one agent."""
-    rows = measured.rows()
-    heads = ["processor time, one agent alone = 1", *(f"{row['num_agents']} agents" for row in rows)]
-    lines = [
-        ["every agent for itself", *(f"{row['alone']:.1f}" for row in rows)],
-        ["all together", *(f"{row['together']:.1f}" for row in rows)],
-    ]
-    return publishing.table(heads, lines)
+    """How much longer all agents together take than every agent for itself."""
+    words = [f"{row['together_over_alone']:.1f} ({row['num_agents']})" for row in measured.rows()]
+    return f"All together take so many times as long as every agent for itself (agents): {', '.join(words)}."
 
 
 def _options() -> argparse.Namespace:

@@ -47,9 +47,10 @@ def section(measured: Measurement) -> str:
             cells.append(publishing.interval(row, "ratio", ".2f"))
             num_ahead += row["ratio_high"] < 1.0
             num_behind += row["ratio_low"] > 1.0
-        lines.append([*cells, f"{100 * own['coverage_90']:.0f} %"])
+        if own["part"] != "past":  # "between" is of it
+            lines.append([*cells, f"{100 * own['coverage_90']:.0f} %"])
     heads = ["log, detections, part", "CRPS of height, m", "over linear's", "over constant velocity's", "in 90 %"]
-    num = len(lines) * len(RIVALS)
+    num = len(measured.rows(estimator=OWN)) * len(RIVALS)
     text = (
         f"Ahead with the whole interval in {num_ahead} of {num} comparisons, behind in {num_behind}; the others are ties. "
         "Intervals of 95 % over aircraft (`aircraft`) or flights (`adsb`)."

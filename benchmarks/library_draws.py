@@ -133,13 +133,19 @@ def row(key: str, name: str, own: EpisodeScores, first: EpisodeScores, unit_m: f
 
 def section(measured: Measurement) -> str:
     """What the library with the most tracks is worth, by itself and as a share of the hypotheses."""
-    alone, shared = (measured.rows(forecast=measured.rows()[index]["forecast"]) for index in (-2, -1))
-    column = "worse_than_cadence_percent"
-    lines = [
-        [row["set"], *(publishing.interval(one, column, "z.0f") for one in (row, other))]
-        for row, other in zip(alone, shared, strict=True)
-    ]
-    return publishing.table(["worse than CADENCE, %", alone[0]["forecast"], shared[0]["forecast"]], lines)
+    words = []
+    for kind in (measured.rows()[index]["forecast"] for index in (-2, -1)):
+        rows = sorted(measured.rows(forecast=kind), key=lambda row: row["worse_than_cadence_percent"])
+        least, greatest = (publishing.interval(row, "worse_than_cadence_percent", "z.0f") for row in (rows[0], rows[-1]))
+        worse, better = (
+            sum(sign * row[f"worse_than_cadence_percent_{bound}"] > 0 for row in rows)
+            for sign, bound in ((1, "low"), (-1, "high"))
+        )
+        words.append(
+            f"{kind}: worse by {least} % ({rows[0]['set']}) to {greatest} % ({rows[-1]['set']}), "
+            f"with certainty in {worse} of {len(rows)} sets, better in {better}."
+        )
+    return "\n".join(f"* {line[0].upper()}{line[1:]}" for line in words)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -72,16 +72,19 @@ def rows(num_seeds: int) -> Iterator[publishing.Row]:
 
 
 def section(measured: Measurement) -> str:
-    """A line a cell."""
-    heads = ["seen", "every", "true noise", "estimates: median [10 %, 90 %]", "interval holds it", "errors in time found"]
-    lines = [
-        [
-            row["seen"], f"{row['interval_s']:g} s", f"{row['truth']:.2g} {row['unit']}",
-            f"{row['median']:.2g} [{row['low_10']:.2g}, {row['high_90']:.2g}] {row['unit']}",
-            f"{row['num_held']:g} of {row['num_told']:g}", f"{row['num_timing']:g}",
-        ]
-        for row in measured.rows()
-    ]  # fmt: skip
+    """A line for each true noise, over all ways to be seen."""
+    heads = ["true noise", "medians found", "least 10 %", "greatest 90 %", "interval holds it", "errors in time found"]
+    lines = []
+    for truth, unit in dict.fromkeys((row["truth"], row["unit"]) for row in measured.rows()):
+        rows = measured.rows(truth=truth, unit=unit)
+        medians = [row["median"] for row in rows]
+        held, told, timing = (sum(row[name] for row in rows) for name in ("num_held", "num_told", "num_timing"))
+        lines.append(
+            [
+                f"{truth:.2g} {unit}", f"{min(medians):.2g} to {max(medians):.2g}", f"{min(row['low_10'] for row in rows):.2g}",
+                f"{max(row['high_90'] for row in rows):.2g}", f"{held:g} of {told:g}", f"{timing:g}",
+            ]
+        )  # fmt: skip
     return publishing.table(heads, lines)
 
 

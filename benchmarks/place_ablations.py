@@ -273,15 +273,19 @@ def _error_rows(own: EpisodeScores, full: EpisodeScores | None, measure: str) ->
 
 
 def section(measured: Measurement) -> str:
-    """What leaving out a part, and more or fewer training episodes, cost in energy score."""
+    """What leaving out a part, and more or fewer training episodes, cost in energy score, where that is certain of one kind."""
     heads = ["worse than the full network", *(f"{kind}, %" for kind in KINDS)]
     lines = []
     for variant in dict.fromkeys(row["variant"] for row in measured.rows()):
-        if variant != "full":
-            found = [measured.rows(variant=variant, episodes=kind) for kind in KINDS]
-            costs = [publishing.interval(rows[0], "energy_score_cost_percent", "z.0f") if rows else "–" for rows in found]
-            lines.append([variant, *costs])
+        rows = [row for kind in KINDS for row in measured.rows(variant=variant, episodes=kind)]
+        if variant != "full" and any(_is_certain(row) for row in rows):
+            lines.append([variant, *(publishing.interval(row, "energy_score_cost_percent", "z.0f") for row in rows)])
     return publishing.table(heads, lines)
+
+
+def _is_certain(row: publishing.Row) -> bool:
+    low, high = (row[f"energy_score_cost_percent_{bound}"] for bound in ("low", "high"))
+    return low > 0 or high < 0
 
 
 def publish(setup: Setup, seeds: Sequence[int], docs: Path | None) -> None:

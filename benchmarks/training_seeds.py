@@ -237,16 +237,14 @@ def tables(found: Mapping[World, tuple[Scores, float]], setup: Setup) -> dict[st
 
 
 def section(measured: Measurement) -> str:
-    """Leads of every seed, and over all pairs of seeds."""
-    lines = []
+    """The mean lead over the seeds, and what pairs of them make of it."""
+    words = []
     for pair in measured.rows("pairs"):
-        rows = measured.rows("leads", set=pair["set"], measure="energy score")
+        (mean,) = measured.rows("leads", set=pair["set"], measure="energy score", seed="mean")
+        lead, rest = publishing.interval(mean, "lead_percent", ".0f").split(" ", 1)
         pairs = f"{pair['lead_percent_least']:.1f} to {pair['lead_percent_greatest']:.1f}"
-        single = ", ".join(f"{row['lead_percent']:.1f}" for row in rows if row["seed"] != "mean")
-        (mean,) = (row for row in rows if row["seed"] == "mean")
-        lines.append([pair["set"], single, publishing.interval(mean, "lead_percent", ".0f"), pairs])
-    heads = ["lead over the better GrAMMI, %", "seed by seed", "mean of the seeds", "all pairs of seeds"]
-    return publishing.table(heads, lines)
+        words.append(f"{pair['set']} {lead} % {rest}, by pair of seeds {pairs}")
+    return f"Lead over the better GrAMMI: {'; '.join(words)}."
 
 
 def main() -> int:
