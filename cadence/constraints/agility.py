@@ -21,13 +21,13 @@ class Agility:
     max_bend_m    length of their difference: acceleration times the square of a step's time; None: any
     max_turn_rad  angle between them; None: any
     least_m       shorter steps have no direction
-    longest_m     how long a step may be, which smoothing brings about as well; None: any
+    longest_m     how long a step may be, of all or each track's [K, 1], which smoothing brings about as well; None: any
     """
 
     max_bend_m: float | None = None
     max_turn_rad: float | None = None
     least_m: float = 0.0
-    longest_m: float | None = None
+    longest_m: float | Tensor | None = None
 
     @property
     def is_limited(self) -> bool:

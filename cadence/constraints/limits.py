@@ -47,17 +47,20 @@ def within_limits(
         position_m: the tracks.
         keep_out: where they may not be.
         is_pinned: [R, K, T] steps that a way round an obstacle leaves exactly where they are.
-        longest_m: how long a step may be, each [T - 1] or all, or None.
+        longest_m: how long a step may be, each [T - 1], each of a track [K, 1] or all, or None.
         is_held: [R, K, T] steps that stay where they are when a track is slowed down; at least one a track.
 
     Returns:
         The tracks, and which of them are where they may be [R, K]; ask `exceeds` whether they are slow enough.
     """
     moved, is_clear = position_m, torch.ones(position_m.shape[:2], dtype=torch.bool)
+    limit_m = longest_m
+    if isinstance(longest_m, Tensor) and longest_m.ndim == 2:
+        limit_m = longest_m.repeat(len(moved), 1)
     has_turns = keep_out.obstacles.count and not (longest_m is None and keep_out.edge_m is None)
     for _ in range(_ROUNDS if has_turns else 1):
         if longest_m is not None:
-            slowed, _ = limit_steps(moved.flatten(0, 1), is_held.flatten(0, 1), longest_m)
+            slowed, _ = limit_steps(moved.flatten(0, 1), is_held.flatten(0, 1), limit_m)
             moved = slowed.view_as(moved)
         moved = keep_out.inside(moved)
         if keep_out.obstacles.count:

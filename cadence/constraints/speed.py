@@ -8,7 +8,7 @@ _SLACK = 1e-9
 
 
 def exceeds(position_m: Tensor, longest_m: float | Tensor) -> Tensor:
-    """Whether a step of the tracks [..., T, 2] is longer than `longest_m`, of all or each [T - 1]; a rounding error is not."""
+    """Whether a step of the tracks [..., T, 2] is longer than `longest_m`, which [..., T - 1] fits; a rounding error is not."""
     is_long: Tensor = position_m.diff(dim=-2).norm(dim=-1) > longest_m * (1.0 + 1e-6)
     return is_long.any(dim=-1)
 
@@ -46,7 +46,7 @@ def limit_steps(position_m: Tensor, is_pinned: Tensor, longest_m: float | Tensor
     Args:
         position_m: [N, T, 2] metres, float64.
         is_pinned: [N, T] bool, steps that stay exactly where they are; at least one a track.
-        longest_m: the limit of all steps, or of each one [T - 1].
+        longest_m: the limit of all steps, of each one [T - 1], or of each track's [N, 1].
 
     Returns:
         Tracks [N, T, 2], those that kept the limit unchanged, and whether they keep it now [N]: two pinned steps may be further
@@ -55,7 +55,8 @@ def limit_steps(position_m: Tensor, is_pinned: Tensor, longest_m: float | Tensor
     is_long = exceeds(position_m, longest_m)
     moved = position_m.clone()
     if bool(is_long.any()):
-        moved[is_long] = _limited(position_m[is_long], is_pinned[is_long], longest_m * (1.0 - _SLACK))
+        limit_m = longest_m[is_long] if isinstance(longest_m, Tensor) and longest_m.ndim == 2 else longest_m
+        moved[is_long] = _limited(position_m[is_long], is_pinned[is_long], limit_m * (1.0 - _SLACK))
     return moved, ~exceeds(moved, longest_m)
 
 
@@ -77,7 +78,7 @@ def _limited(position_m: Tensor, is_pinned: Tensor, longest_m: float | Tensor) -
 
 def _shortened(step_m: Tensor, longest_m: float | Tensor) -> Tensor:
     length = step_m.norm(dim=-1, keepdim=True)
-    limit = longest_m[:, None] if isinstance(longest_m, Tensor) else longest_m
+    limit = longest_m[..., None] if isinstance(longest_m, Tensor) else longest_m
     shortened: Tensor = step_m * (limit / length.clamp_min(limit))
     return shortened
 

@@ -38,7 +38,8 @@ class Feasibility:
     keep_out       what is in the way; its obstacles may be none
     step_s         of the grid
     max_speed_mps  that is stated, None for no limit
-    plausible_speed_mps  what the log's own detections let one believe; tracks keep it, but are not guided by it
+    plausible_mps  [K] top speed of each hypothesis, as the log's own detections let one believe; tracks keep it, but are not
+                   guided by it
     max_acceleration_mps2, max_turn_rate_dps  that are stated, None for no limit; tracks are smoothed until they keep them
     num_steps      of guidance on each clean estimate
     """
@@ -46,13 +47,13 @@ class Feasibility:
     keep_out: KeepOut
     step_s: float
     max_speed_mps: float | None = None
-    plausible_speed_mps: float | None = None
+    plausible_mps: Tensor | None = None
     max_acceleration_mps2: float | None = None
     max_turn_rate_dps: float | None = None
     num_steps: int = 3
 
     @classmethod
-    def of(cls, windows: WindowBatch, config: GuidanceConfig, plausible_speed_mps: float | None = None) -> Self:
+    def of(cls, windows: WindowBatch, config: GuidanceConfig, plausible_mps: Tensor | None = None) -> Self:
         """What the active agents of windows, one a row, must obey; without a context there are no obstacles."""
         context = windows.context
         datum_m = torch.zeros(windows.num_windows, 2, dtype=torch.float64) if context is None else context.datum_m
@@ -62,7 +63,7 @@ class Feasibility:
         obstacles = Obstacles.none() if context is None else context.obstacles
         keep_out = KeepOut(obstacles, config.margin_m, offset_m)
         agility = config.max_acceleration_mps2, config.max_turn_rate_dps
-        return cls(keep_out, windows.step_s, config.max_speed_mps, plausible_speed_mps, *agility)
+        return cls(keep_out, windows.step_s, config.max_speed_mps, plausible_mps, *agility)
 
     @property
     def is_stated(self) -> bool:
@@ -70,10 +71,12 @@ class Feasibility:
         return self.keep_out.obstacles.count > 0 or self.max_speed_mps is not None
 
     @property
-    def longest_m(self) -> float | None:
-        """How long a step may be."""
-        limits = [speed for speed in (self.max_speed_mps, self.plausible_speed_mps) if speed is not None]
-        return min(limits) * self.step_s if limits else None
+    def longest_m(self) -> float | Tensor | None:
+        """How long a step may be, of all hypotheses or of each [K, 1]."""
+        if self.plausible_mps is not None:
+            most_mps = math.inf if self.max_speed_mps is None else self.max_speed_mps
+            return self.plausible_mps.clamp(max=most_mps)[:, None] * self.step_s
+        return None if self.max_speed_mps is None else self.max_speed_mps * self.step_s
 
     def guide(self, position_m: Tensor, sigma_m: Tensor, rows: slice) -> Tensor:
         """Clean estimates [R', K, T, 2] moved towards the feasible, as far as the bank is uncertain there."""
@@ -100,8 +103,8 @@ class Feasibility:
             even = torch.full(position_m.shape[:2], 1.0 / position_m.shape[1], dtype=torch.float64)
             return position_m, even, torch.ones_like(even, dtype=torch.bool)
         moved, is_feasible = self._within_limits(position_m, sigma_m, length_m, agility)
-        if self.plausible_speed_mps is not None:
-            is_plausible = is_feasible & ~exceeds(moved, self.plausible_speed_mps * self.step_s)
+        if self.plausible_mps is not None:
+            is_plausible = is_feasible & ~exceeds(moved, float(self.plausible_mps.max()) * self.step_s)
             is_feasible = torch.where(is_plausible.any(1, keepdim=True), is_plausible, is_feasible)
         shift = (moved - position_m).norm(dim=-1) / (sigma_m[:, None] + _PINNED_SHARE * length_m)
         log_weight = -0.5 * (shift**2).mean(-1)

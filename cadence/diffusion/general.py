@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from cadence.bank.bank import Bank, BankPosterior
+from cadence.bank.plausible import TopSpeed
 from cadence.bank.pool import BankPool
 from cadence.bank.rows import active_rows, scatter_hypotheses, with_status
 from cadence.diffusion.feasible import Feasibility, redrawn, resampled
@@ -73,7 +74,7 @@ class GeneralModel:
     sampler    "rotation", "ddim" or "dpmpp"
     num_steps  evaluations of the network for each hypothesis
     guidance   how constraints act: a speed limit, and the obstacles of the windows' context
-    plausible_speed_mps  what the log's detections show of how fast its targets are; no track is faster
+    top_speed  what the log's detections show of how fast its targets are at most; no track is faster
     is_smooth  what the network adds to a track of the bank is smoothed (`cadence.diffusion.transport`)
     share_past, share_future  share of the hypotheses that the network moves, up to the origin and after it; the others stay
                samples of the bank
@@ -87,7 +88,7 @@ class GeneralModel:
     sampler: SamplerName = "rotation"
     num_steps: int = 6
     guidance: GuidanceConfig = field(default_factory=GuidanceConfig)
-    plausible_speed_mps: float | None = None
+    top_speed: TopSpeed | None = None
     is_smooth: bool = True
     share_past: float = 1.0
     share_future: float = 1.0
@@ -125,7 +126,8 @@ class GeneralModel:
 
     def _drawn(self, windows: WindowBatch, num_hypotheses: int) -> "_Rows":
         """Tracks of the active agents as near to the limits as they can be brought."""
-        limits = Feasibility.of(windows, self.guidance, self.plausible_speed_mps)
+        plausible_mps = None if self.top_speed is None else self.top_speed.spread(num_hypotheses)
+        limits = Feasibility.of(windows, self.guidance, plausible_mps)
         posterior = self.bank.posterior(windows, num_hypotheses)
         is_guided = self.guidance.mode == "clean" and limits.is_stated
         sample_m = self.denoised(posterior, windows, limits.guide if is_guided else None)

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 
 from cadence.bank.bank import Bank
-from cadence.bank.plausible import plausible_speed
+from cadence.bank.plausible import TopSpeed
 from cadence.diffusion.gate import gated
 from cadence.diffusion.general import GeneralModel
 from cadence.errors import ConfigError, DeviceError
@@ -51,7 +51,7 @@ def _fitted(model: GeneralModel, samplings: Samplings, data: FittingData) -> Fit
     fitted = dataclasses.replace(
         fitted_model(model, data, samplings.general.is_gated),
         guidance=samplings.guidance,
-        plausible_speed_mps=plausible_speed(data.tracks, data.grid.step_s),
+        top_speed=TopSpeed.of_log(data.tracks, data.grid.step_s),
     )
     return Fitted(fitted, _about(fitted))
 
@@ -70,7 +70,7 @@ def _about(model: GeneralModel) -> dict[str, Any]:
     bank = model.bank
     ratios = dataclasses.asdict(model.gate) if model.gate else {}
     return {
-        "plausible_speed_mps": model.plausible_speed_mps,
+        "plausible_speed_mps": None if model.top_speed is None else model.top_speed.limit_mps,
         "sampler": model.sampler,
         "num_steps": model.num_steps if model.network is not None else 0,
         "network": {"share_past": model.share_past, "share_future": model.share_future, **ratios},

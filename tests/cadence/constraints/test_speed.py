@@ -52,6 +52,16 @@ def test_one_jump_is_spread_over_its_neighbours_by_hand() -> None:
     assert bool(is_kept) and moved[0, :, 0].tolist() == pytest.approx([0.0, 1.0, 3.0, 4.0], abs=1e-6)
 
 
+def test_each_track_keeps_a_limit_of_its_own() -> None:
+    track, where = tracks(), pins(50, 30, 0)
+    longest = torch.linspace(1.0, 4.0, 50, dtype=torch.float64)[:, None]
+    moved, is_kept = limit_steps(track, where, longest)
+    assert bool(is_kept.all())
+    for row in (0, 20, 49):
+        alone, _ = limit_steps(track[row : row + 1], where[:1], float(longest[row]))
+        torch.testing.assert_close(moved[row], alone[0])
+
+
 def test_free_ends_are_only_shortened() -> None:
     track = torch.tensor([[[0.0, 0.0], [0.0, 6.0], [1.0, 6.0], [9.0, 6.0]]], dtype=torch.float64)
     moved, is_kept = limit_steps(track, pins(1, 4, 1), 2.0)

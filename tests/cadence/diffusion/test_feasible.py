@@ -9,6 +9,7 @@ import torch
 from test_general import network
 
 from cadence.bank.bank import Bank
+from cadence.bank.plausible import TopSpeed
 from cadence.constraints.agility import Agility
 from cadence.constraints.checker import segments_in_collision, states_in_collision
 from cadence.constraints.limits import KeepOut
@@ -218,3 +219,14 @@ def test_weights_are_met_on_average() -> None:
     out = resampled(name, weight, torch.arange(400))[..., 0, 0]
     share = torch.bincount(out.long().flatten(), minlength=3) / 1200
     torch.testing.assert_close(share.double(), weight[0], atol=0.04, rtol=0)
+
+
+def test_hypotheses_keep_the_top_speeds_that_the_log_makes_plausible() -> None:
+    top_speed = TopSpeed(1.3)
+    free = GeneralModel(BANK, None).sample(WINDOWS, NUM).position_m
+    kept = dataclasses.replace(GeneralModel(BANK, None), top_speed=top_speed).sample(WINDOWS, NUM).position_m
+    assert exceeds(free, top_speed.limit_mps).any() and not exceeds(kept, top_speed.limit_mps).any()
+    limits = Feasibility.of(WINDOWS, GuidanceConfig(), top_speed.spread(NUM))
+    moved, _, is_kept = limits.finish(POSTERIOR.sample_m, POSTERIOR.sigma_m, LENGTH_M)
+    assert is_kept.all() and not exceeds(moved, top_speed.spread(NUM)[:, None]).any()
+    assert Feasibility.of(WINDOWS, GuidanceConfig(max_speed_mps=1.28), top_speed.spread(NUM)).longest_m.max() == 1.28
