@@ -23,7 +23,7 @@ _MAX_STEPS = 20.0
 """Pairs are so many steps apart at least: near ones tell of moments, far ones where noise rules those. Over longer gaps the
 straight way says little of the speed."""
 
-_LEAST, _MOST = 0.96, 1.10
+_LEAST, _MOST = 1.0, 1.12
 """Of 24 patrols and 23 recordings of aircraft, ships and a drone, seen 5 to 30 % of the time, the speed that one true step of
 the grid in a thousand exceeds is .92 to 1.14 times the fastest that was seen (eight in ten), half of them .98 to 1.07."""
 
