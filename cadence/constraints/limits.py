@@ -59,7 +59,7 @@ def within_limits(
         limit_m = longest_m.repeat(len(moved), 1)
     has_turns = keep_out.obstacles.count and not (longest_m is None and keep_out.edge_m is None)
     for _ in range(_ROUNDS if has_turns else 1):
-        if longest_m is not None:
+        if limit_m is not None:
             slowed, _ = limit_steps(moved.flatten(0, 1), is_held.flatten(0, 1), limit_m)
             moved = slowed.view_as(moved)
         moved = keep_out.inside(moved)
