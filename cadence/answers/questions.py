@@ -199,15 +199,21 @@ def _times(time_s: Float64s, track_m: Float64s, at_s: Float64s, weight: Float64s
     """
     if len(time_s) < 3:
         return law(weight, at_s)
-    bend = np.full(track_m.shape[:2], 0.0)
-    bend[:, 1:-1] = np.nan_to_num(np.hypot(*np.moveaxis(np.diff(track_m, 2, axis=1), -1, 0)))
-    step_m = np.hypot(*np.moveaxis(np.diff(track_m, axis=1), -1, 0))
     left = np.clip(np.searchsorted(time_s, np.nan_to_num(at_s, nan=time_s[0]), "right") - 1, 0, len(time_s) - 2)
     rows = np.arange(len(at_s))
-    sagitta_m = np.minimum(bend[rows, left], bend[rows, left + 1]) / 8.0  # a corner at one end is no arc
+    sagitta_m = np.minimum(_bend_m(track_m, left), _bend_m(track_m, left + 1)) / 8.0  # a corner at one end is no arc
+    step_m = np.hypot(*(track_m[rows, left + 1] - track_m[rows, left]).T)
     with np.errstate(divide="ignore", invalid="ignore"):
-        share = np.nan_to_num(np.minimum(sagitta_m / step_m[rows, left], 0.5))
+        share = np.nan_to_num(np.minimum(sagitta_m / step_m, 0.5))
     return law(weight, at_s, share * (time_s[left + 1] - time_s[left]))
+
+
+def _bend_m(track_m: Float64s, step: Indices) -> Float64s:
+    """How far tracks [K, T, 2] leave the straight way at a step each [K]: zero at their ends and beside an absence."""
+    rows, inner = np.arange(len(step)), np.clip(step, 1, track_m.shape[1] - 2)
+    before, at, after = (track_m[rows, inner + side] for side in (-1, 0, 1))
+    bend_m: Float64s = np.where(inner == step, np.nan_to_num(np.hypot(*((after - at) - (at - before)).T)), 0.0)
+    return bend_m
 
 
 def _appears(time_s: Float64s, track_m: Float64s, stays: Visits) -> Bools:

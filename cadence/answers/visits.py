@@ -88,13 +88,26 @@ def visits(time_s: Float64s, track_m: Float64s, area: Area) -> Visits:
     """The stays of tracks [K, T, 2] in `area`; where a track is absent (NaN) it is in no area."""
     if len(time_s) == 1:  # a moment is a stay without length
         time_s, track_m = np.repeat(time_s, 2), np.repeat(track_m, 2, axis=1)
-    start_m, end_m = track_m[:, :-1].reshape(-1, 2), track_m[:, 1:].reshape(-1, 2)
+    near = _near_steps(track_m, area)
+    start_m, end_m = track_m[:, near].reshape(-1, 2), track_m[:, near + 1].reshape(-1, 2)
     known = np.flatnonzero(np.isfinite(start_m).all(1) & np.isfinite(end_m).all(1))
     piece, first, last = pieces_inside(start_m[known], end_m[known], area)
-    story, step = np.divmod(known[piece], len(time_s) - 1)
+    story, step = np.divmod(known[piece], max(len(near), 1))
+    step = near[step]
     left, right = time_s[step], time_s[step + 1]
     start_s, end_s = (np.where(share == 1, right, left + share * (right - left)) for share in (first, last))
     return _joined(story, start_s, end_s, len(track_m))
+
+
+def _near_steps(track_m: Float64s, area: Area) -> Indices:
+    """Steps from which any of the tracks [K, T, 2] may lead into an area, by a look at the box of all of them."""
+    if not len(track_m):
+        return np.zeros(0, dtype=np.intp)
+    low, high = np.fmin.reduce(track_m, axis=0), np.fmax.reduce(track_m, axis=0)
+    low, high = np.fmin(low[:-1], low[1:]), np.fmax(high[:-1], high[1:])
+    west, south, east, north = area.bounds_m
+    # where no track is the box is NaN, which meets nothing
+    return np.flatnonzero((low[:, 0] <= east) & (high[:, 0] >= west) & (low[:, 1] <= north) & (high[:, 1] >= south))
 
 
 def _joined(story: Indices, start_s: Float64s, end_s: Float64s, num_stories: int) -> Visits:

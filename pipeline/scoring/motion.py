@@ -8,7 +8,6 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
-from scipy.stats import wasserstein_distance
 from torch import Tensor
 
 from cadence.arrays import Float64s
@@ -47,7 +46,12 @@ class MotionSample:
         """Wasserstein distance of a law; NaN where one of the two knows nothing of it."""
         if not self.mass[law].sum() or not other.mass[law].sum():
             return float("nan")
-        return float(wasserstein_distance(self.values[law], other.values[law], self.mass[law], other.mass[law]))
+        mass, other_mass = self.mass[law] / self.mass[law].sum(), other.mass[law] / other.mass[law].sum()
+        values = np.concatenate([self.values[law], other.values[law]])
+        order = np.argsort(values)
+        # the area between the two distribution functions; scipy.stats says the same and takes a second to import
+        ahead = np.cumsum(np.concatenate([mass, -other_mass])[order])[:-1]
+        return float(np.abs(ahead) @ np.diff(values[order]))
 
 
 MotionLaws = Mapping[str, MotionSample]
