@@ -4,8 +4,8 @@ Looks are not independent, and hypotheses are not where targets may be: with all
 of a wrong place. Detections that were withheld show whether weighing by silence helps, and how much of it.
 """
 
-import dataclasses
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -31,7 +31,9 @@ class ChosenExponent:
     ratios: dict[float, float]
 
 
-def choose_exponent(estimator: Estimator, windows: WindowBatch, withheld: Detections, silence: Silence) -> ChosenExponent:
+def choose_exponent(
+    estimator: Estimator, windows: WindowBatch, withheld: Detections, silences: Sequence[Silence]
+) -> ChosenExponent:
     """The exponent by which hypotheses of `windows` foresee withheld detections best.
 
     Zero where silence harms for certain; above `SAFE` only where that is certainly better (a standard error).
@@ -40,23 +42,26 @@ def choose_exponent(estimator: Estimator, windows: WindowBatch, withheld: Detect
         estimator: what draws, fitted to the log.
         windows: with their context, without the detections that are withheld.
         withheld: these.
-        silence: whose exponent is asked for.
+        silences: whose exponent is asked for.
     """
     drawn = estimator.sample(windows, _NUM_DRAWN).position_m
-    said = dataclasses.replace(silence, exponent=1.0).log_likelihood(known_tracks(windows, drawn))
+    tracks = known_tracks(windows, drawn)
+    said = [
+        sum(each, torch.zeros(())) for each in zip(*(one.log_likelihoods(tracks, CANDIDATES) for one in silences), strict=True)
+    ]
     foreseen, is_used = at_detections(drawn, windows, withheld)
-    plain = _scores(foreseen, torch.zeros_like(said), withheld)
-    is_tested = is_used.any(-1) & (said.amax(1) > said.amin(1) + 1e-9)
+    plain = _scores(foreseen, torch.zeros_like(said[0]), withheld)
+    is_tested = is_used.any(-1) & (said[0].amax(1) > said[0].amin(1) + 1e-9)
     num = int(is_tested.sum())
     if num < LEAST_TESTS:
         return ChosenExponent(SAFE, num, {})
 
-    def ratio(exponent: float) -> Tensor:
-        score = _scores(foreseen, exponent * said, withheld)
+    def ratio(log_weight: Tensor) -> Tensor:
+        score = _scores(foreseen, log_weight, withheld)
         total, before = (torch.where(is_used, value, 0.0).sum(-1)[is_tested] for value in (score, plain))
         return total / before.clamp_min(1e-9)
 
-    ratios = {exponent: ratio(exponent) for exponent in CANDIDATES}
+    ratios = {exponent: ratio(log_weight) for exponent, log_weight in zip(CANDIDATES, said, strict=True)}
     chosen = SAFE
     if _certainly(ratios[SAFE] - 1.0, 1.0):
         chosen = 0.0

@@ -40,6 +40,11 @@ class DetectionCurve:
             return 0.0
         return float(self.distance[min(seen[-1] + 1, len(self.distance) - 1)])
 
+    @property
+    def half(self) -> float:
+        """The farthest of its points at which it detects half as surely as at best."""
+        return float(self.distance[np.flatnonzero(self.probability >= 0.5 * self.probability.max())[-1]])
+
 
 @dataclass(frozen=True, eq=False)
 class Sector:

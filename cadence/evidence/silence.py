@@ -18,6 +18,7 @@ from torch import Tensor
 from cadence.arrays import Bools, Float64s, Int64s
 from cadence.constraints.obstacles import Obstacles
 from cadence.evidence.footprints import Area, DetectionCurve, detection_probability
+from cadence.evidence.ground import WIDTH, Ground, without_beyond
 from cadence.types import Tracks
 
 _MOST_NUMBERS = 4_000_000
@@ -89,12 +90,14 @@ class Silence:
     exponent   of the likelihood, 0 (silence says nothing) to 1 (looks are independent)
     most_sure  no look is believed to detect more surely than this: footprints are never known so well
     obstacles  that hide what is behind them; none: nothing does
+    ground     beyond which silence says nothing; None: it speaks of every place
     """
 
     looks: tuple[Looks, ...]
     exponent: float = 1.0
     most_sure: float = 0.98
     obstacles: Obstacles = field(default_factory=Obstacles.none)
+    ground: Ground | None = None
     name: str = "silence"
 
     def __post_init__(self) -> None:
@@ -144,19 +147,27 @@ class Silence:
 
     def log_likelihood(self, tracks: Tracks) -> Tensor:
         """Sum over the looks of log(1 - P) at the places between two steps, times the exponent [B, K, A]."""
+        return self.log_likelihoods(tracks, (self.exponent,))[0]
+
+    def log_likelihoods(self, tracks: Tracks, exponents: Sequence[float]) -> tuple[Tensor, ...]:
+        """`log_likelihood` with each of the exponents in turn."""
         position_m, time_s = tracks.position_m.double().numpy(), tracks.time_s.double().numpy()
         names = tracks.agent_ids or (None,) * position_m.shape[2]
-        total = np.zeros(position_m.shape[:3])
-        for row in range(len(total)):
+        total = np.zeros((len(exponents), *position_m.shape[:3]))
+        for row in range(len(position_m)):
+            ground = None if self.ground is None else self.ground.until(float(time_s[row, -1]))
             for looks in self.looks:
-                total[row] += looks.trust * self._missed(looks, position_m[row], time_s[row], names)
-        return torch.from_numpy(self.exponent * total)
+                total[:, row] += self._missed(looks, position_m[row], time_s[row], names, exponents, ground)
+        return tuple(torch.from_numpy(one) for one in total)
 
-    def _missed(self, looks: Looks, position_m: Float64s, time_s: Float64s, names: Sequence[str | None]) -> Float64s:
-        """Log probability [K, A] that the looks within `time_s` [T] miss the tracks [K, A, T, 2]."""
-        total = np.zeros(position_m.shape[:2])
+    def _missed(
+        self, looks: Looks, position_m: Float64s, time_s: Float64s, names: Sequence[str | None], exponents: Sequence[float],
+        ground: shapely.Geometry | None,
+    ) -> Float64s:  # fmt: skip
+        """Log probability, times each exponent, that the looks within `time_s` [T] miss the tracks [K, A, T, 2]: [E, K, A]."""
+        total = np.zeros((len(exponents), *position_m.shape[:2]))
         some = _within_reach(looks, position_m, time_s)
-        at_once = max(1, _MOST_NUMBERS // max(1, 2 * total.size))
+        at_once = max(1, _MOST_NUMBERS // max(1, 2 * total[0].size))
         for begin in range(0, len(some), at_once):
             part = some[begin : begin + at_once]
             silent = np.stack([part.is_silent(name) for name in names])
@@ -164,7 +175,15 @@ class Silence:
             missed = np.log1p(-np.minimum(part.probability(place_m), self.most_sure))
             if self.obstacles.count:
                 missed = np.where(self._is_hidden(part, place_m, missed < 0), 0.0, missed)
-            total += np.where(silent & np.isfinite(missed), missed, 0.0).sum(axis=-1)
+            missed = looks.trust * np.where(silent & np.isfinite(missed), missed, 0.0)
+            if ground is None:
+                total += np.multiply.outer(exponents, missed.sum(axis=-1))
+                continue
+            tells = (missed < 0).any(axis=0)
+            agent = np.nonzero(tells)[0]
+            for each, exponent in zip(total, exponents, strict=True):
+                counted = without_beyond(exponent * missed[:, tells], place_m[:, tells], ground)
+                np.add.at(each, (slice(None), agent), counted)
         return total
 
     def _is_hidden(self, looks: Looks, place_m: Float64s, is_asked: Bools) -> Bools:
@@ -181,6 +200,21 @@ class Silence:
             found |= shapely.intersects(shape, lines)
         hidden[where] = found
         return hidden
+
+
+def ground_of(looks: Sequence[Looks], seen_s: Float64s, seen_m: Float64s) -> Ground | None:
+    """The ground between the sensors of looks and the places [D, 2] where agents were seen at `seen_s` [D]; None without looks.
+
+    It is as wide as the sensors see that see farthest, where seeing is half of what they detect at best.
+    """
+    used = [some for some in looks if len(some)]
+    if not used:
+        return None
+    time_s = np.concatenate([seen_s, *(some.time_s for some in used)])
+    position_m = np.concatenate([seen_m, *(some.position_m for some in used)])
+    order = np.argsort(time_s, kind="stable")
+    sees_m = max(some.curve.half * float(np.median(some.range_m)) for some in used)
+    return Ground(time_s[order], position_m[order], WIDTH * sees_m)
 
 
 def _shapes(obstacles: Obstacles) -> list[shapely.Geometry]:

@@ -1,16 +1,17 @@
 """What the looks of a mission's sensors say: evidence for its windows, with an exponent that withheld detections chose."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
 
+from cadence.arrays import Float64s
 from cadence.bank.hindsight import withhold
 from cadence.constraints.obstacles import Obstacles
 from cadence.evidence.exponents import SAFE, ChosenExponent, choose_exponent
 from cadence.evidence.settings import WeighingConfig
-from cadence.evidence.silence import Looks, Silence
+from cadence.evidence.silence import Looks, Silence, ground_of
 from cadence.types import Estimator, Evidence
 from pipeline.looks import Footprint, silences
 from pipeline.windows import MissionWindows
@@ -53,6 +54,8 @@ def hear_silence(
     _, parts = silences(heard, obstacles, SAFE)
     if not parts:
         return HeardSilence(remarks=tuple(remarks))
+    ground = ground_of([some for _, some in looks], *_sightings(windows, start_ns))
+    parts = tuple(replace(part, ground=ground) for part in parts)
     if config.exponent is None:
         chosen = _chosen(parts, estimator, windows, start_ns)
     else:
@@ -61,7 +64,7 @@ def hear_silence(
         why = "hypotheses weighed by it foresee withheld detections worse" if config.exponent is None else "it is set so"
         remarks.append(f"silence of sensors is not used: {why} (infer.evidence.exponent)")
         parts = ()
-    evidence = tuple(Silence(part.looks, chosen.exponent, obstacles=part.obstacles) for part in parts)
+    evidence = tuple(replace(part, exponent=chosen.exponent) for part in parts)
     about = {
         "exponent": chosen.exponent,
         "num_tests": chosen.num_tests,
@@ -70,6 +73,15 @@ def hear_silence(
         "sensors": sorted({footprint.sensor for footprint, _ in heard}),
     }
     return HeardSilence(evidence, {"silence": about}, tuple(remarks))
+
+
+def _sightings(windows: MissionWindows, start_ns: int) -> tuple[Float64s, Float64s]:
+    """When [D], in seconds from the beginning of the mission, and where [D, 2] agents were seen."""
+    seen = windows.batch.detections
+    is_seen = seen.is_observed.numpy()
+    at_s = ((windows.origins_ns - start_ns) * 1e-9)[:, None, None] + seen.time_s.numpy()
+    place_m = windows.datum_m[:, None, None] + seen.position_m.numpy()
+    return at_s[is_seen], place_m[is_seen]
 
 
 def _chosen(parts: Sequence[Silence], estimator: Estimator, windows: MissionWindows, start_ns: int) -> ChosenExponent:
@@ -82,5 +94,4 @@ def _chosen(parts: Sequence[Silence], estimator: Estimator, windows: MissionWind
     if not len(useful):
         return ChosenExponent(SAFE, 0, {})
     pick = useful[torch.linspace(0, len(useful) - 1, min(_NUM_TESTED, len(useful))).round().long()]
-    whole = Silence(tuple(looks for part in parts for looks in part.looks), SAFE)
-    return choose_exponent(estimator, shown[pick], withheld[pick], whole)
+    return choose_exponent(estimator, shown[pick], withheld[pick], parts)

@@ -124,7 +124,7 @@ def test_the_exponent_is_what_withheld_detections_tell(share: float, expected: t
     is_north = np.arange(num) < share * num
     batch, withheld = two_ways(num, np.random.default_rng(0).permutation(is_north))
     times = [100.0 * window + 40.0 + i for window in range(num) for i in (-1.0, 0.0, 1.0)]
-    chosen = choose_exponent(TwoWays(), batch, withheld, Silence((looks(times, (0.0, -200.0)),)))
+    chosen = choose_exponent(TwoWays(), batch, withheld, (Silence((looks(times, (0.0, -200.0)),)),))
     assert chosen.exponent in expected and chosen.num_tests == num and set(chosen.ratios) == set(CANDIDATES)
     assert (chosen.ratios[1.0] < 1) == (share == 1.0)
 
