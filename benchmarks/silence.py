@@ -34,7 +34,7 @@ from cadence.arrays import Float64s
 from cadence.constraints.obstacles import Obstacles
 from cadence.evidence.estimator import WeighingConfig, WithEvidence
 from cadence.evidence.footprints import DetectionCurve
-from cadence.evidence.silence import Silence
+from cadence.evidence.silence import Silence, ground_of
 from cadence.metrics import coverage as coverage_of
 from cadence.metrics import energy_score
 from cadence.metrics.bootstrap import Interval, bootstrap_mean, bootstrap_ratio
@@ -86,6 +86,8 @@ def measure_log(
     rows: list[publishing.Row] = []
     if episode.is_detected.sum() < 3:
         return rows
+    seen = np.flatnonzero(episode.is_detected)
+    ground = ground_of(looks_of(episode, curves, coverage), seen * STEP_S, episode.truth_m[seen])
     for checkpoint in checkpoints:
         loaded = load_estimator(checkpoint, Samplings(device="cpu"))
         table = episode.detections()
@@ -99,7 +101,8 @@ def measure_log(
         if not len(chosen):
             continue
         for run in asked_runs([checkpoint], exponents):
-            evidence = (Silence(looks_of(episode, curves, coverage, run.kinds), run.exponent),) if run.kinds else ()
+            heard = looks_of(episode, curves, coverage, run.kinds)
+            evidence = (Silence(heard, run.exponent, ground=ground),) if run.kinds else ()
             batch = windows.located(episode.start_ns, Obstacles.none(), evidence).batch[chosen]
             weighed = WithEvidence(fitted, WeighingConfig(), loaded.is_apart, loaded.num_past)
             begun_s = time.process_time()

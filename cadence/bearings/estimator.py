@@ -26,7 +26,6 @@ from cadence.bank.switching import SwitchingModels, continue_samples, durations_
 from cadence.bearings.cells import Prior
 from cadence.bearings.draws import Cloud, Known, posterior
 from cadence.bearings.linear import sights_of
-from cadence.evidence.choosing import ENOUGH
 from cadence.evidence.estimator import FEW_FIT
 from cadence.evidence.measurements import Measurements
 from cadence.evidence.weights import hear
@@ -44,6 +43,8 @@ _MOST_MEASUREMENTS = 400
 _LEAST_SHARE = 0.1
 """Of the samples that must count. Below it what bearings allow is not all reached, though nothing shows it (measured)."""
 _NEAREST, _FARTHEST = 0.005, 3.0
+_ENOUGH = 0.5
+"""Of the weighed hypotheses: where fewer count the bank draws."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +101,7 @@ class WithBearings:
         for row, elapsed_s in enumerate(context.elapsed_s.double().tolist()):
             for agent, name in enumerate(names):
                 is_seen = bool(windows.is_active[row, agent])
-                if is_seen and (found.num_effective is None or not float(found.num_effective[row, agent]) < ENOUGH * num):
+                if is_seen and (found.num_effective is None or not float(found.num_effective[row, agent]) < _ENOUGH * num):
                     continue
                 for one in kinds:  # the first kind that speaks of it; logs have one
                     some = one[one.is_about(name, len(names) == 1)]

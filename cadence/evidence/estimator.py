@@ -5,6 +5,7 @@ are drawn anyway; more are drawn only where few of these count. Without evidence
 """
 
 import dataclasses
+import math
 from dataclasses import dataclass, field
 from typing import Self
 
@@ -62,14 +63,20 @@ class WithEvidence:
         if not bool(said.is_touched.any()):
             return self._cut(found)
         weighed = self._chosen(found, said, asked, num_hypotheses)
-        is_short = said.is_touched & (_least_effective(found, said, asked, self.is_apart) < ENOUGH * num_hypotheses)
+        missing = ENOUGH * num_hypotheses / _least_effective(found, said, asked, self.is_apart)
+        is_short = said.is_touched & (missing > 1.0)
         if bool(is_short.any()) and self.config.most_draws > 1:
-            weighed = self._drawn_more(weighed, asked, is_short, num_hypotheses)
+            # as many times as many as are missing, in halves, so that windows can be drawn together
+            times = torch.where(is_short, (2.0 * missing).ceil().mul(0.5).clamp_max(self.config.most_draws), 0.0)
+            for each in times.unique().tolist():
+                if each > 0.0:
+                    weighed = self._drawn_more(weighed, asked, times == each, num_hypotheses, math.ceil(each * num_hypotheses))
         return self._cut(_with_few(weighed, num_hypotheses))
 
-    def _drawn_more(self, weighed: HypothesisSet, windows: WindowBatch, is_short: Tensor, num: int) -> HypothesisSet:
-        """The windows that are short of hypotheses, chosen from many more draws."""
-        num_drawn = self.config.most_draws * num
+    def _drawn_more(
+        self, weighed: HypothesisSet, windows: WindowBatch, is_short: Tensor, num: int, num_drawn: int
+    ) -> HypothesisSet:
+        """The windows that are short of hypotheses, chosen from more draws."""
         at_once = max(1, _MOST_NUMBERS // (2 * num_drawn * windows.num_agents * windows.num_steps))
         for some in torch.split(is_short.nonzero()[:, 0], at_once):
             part = windows[some]

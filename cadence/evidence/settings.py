@@ -8,7 +8,8 @@ class WeighingConfig:
     """How hypotheses are weighed by evidence.
 
     is_used    false: evidence is left out
-    most_draws where fewer than half of the hypotheses of a window count, so many times as many are drawn to choose from
+    most_draws where fewer than four fifths of the hypotheses of a window count, more are drawn to choose from: as many as are
+               missing, but no more than so many times as many
     exponent   of silence, 0 (it says nothing) to 1 (looks are independent); by default chosen where withheld detections tell
     is_equal   hypotheses are drawn again by their weights, so that all count the same and some are there several times
     """

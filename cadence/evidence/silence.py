@@ -183,7 +183,8 @@ class Silence:
             agent = np.nonzero(tells)[0]
             for each, exponent in zip(total, exponents, strict=True):
                 counted = without_beyond(exponent * missed[:, tells], place_m[:, tells], ground)
-                np.add.at(each, (slice(None), agent), counted)
+                for number in np.unique(agent).tolist():
+                    each[:, number] += counted[:, agent == number].sum(axis=1)
         return total
 
     def _is_hidden(self, looks: Looks, place_m: Float64s, is_asked: Bools) -> Bools:

@@ -145,6 +145,19 @@ def test_standing_sensors_that_a_checkpoint_has_learned_do_not_count_twice() -> 
     assert len(both.evidence) == 2 and both.remarks == ()
 
 
+def test_the_ground_lies_between_sensors_and_sightings() -> None:
+    batch, _ = two_ways(3, np.ones(3, dtype=bool))
+    windows = MissionWindows(
+        batch, START_NS + (np.arange(3) * 100 + 50) * 10**9, 10**9, ("T0",), np.array([[0.0, 0], [7, 0], [9, 0]])
+    )
+    plane = Footprint("plane", (((0.0, 0.5), (9.0, 0.0)),))
+    given = (Obstacles.none(), WeighingConfig(exponent=1.0), TwoWays(), windows, START_NS)
+    (silence,) = hear_silence([(plane, looks([60.0, 160.0], (0.0, -200.0)))], *given, knows_standing=False).evidence
+    assert isinstance(silence, Silence) and silence.ground is not None
+    assert silence.ground.time_s.tolist() == pytest.approx([50.0, 60.0, 150.0, 160.0, 250.0])
+    assert silence.ground.position_m.tolist() == [[0.0, 0.0], [0.0, -200.0], [7.0, 0.0], [0.0, -200.0], [9.0, 0.0]]
+
+
 def test_a_log_in_which_silence_misleads_is_gated(monkeypatch: pytest.MonkeyPatch) -> None:
     num = 24
     batch, withheld = two_ways(num, np.zeros(num, dtype=bool))
