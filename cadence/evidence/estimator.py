@@ -68,7 +68,7 @@ class WithEvidence:
         if bool(is_short.any()) and self.config.most_draws > 1:
             # as many times as many as are missing, in halves, so that windows can be drawn together
             times = torch.where(is_short, (2.0 * missing).ceil().mul(0.5).clamp_max(self.config.most_draws), 0.0)
-            for each in times.unique().tolist():
+            for each in sorted(set(times.tolist())):
                 if each > 0.0:
                     weighed = self._drawn_more(weighed, asked, times == each, num_hypotheses, math.ceil(each * num_hypotheses))
         return self._cut(_with_few(weighed, num_hypotheses))
