@@ -4,7 +4,9 @@ import math
 import re
 from datetime import UTC, datetime
 
-_ISO = re.compile(r"(\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d)(?:\.(\d{1,9})\d*)?(?: ?(Z|UTC|[+-]\d\d:?\d\d)(?: UTC)?)?")
+_ISO = re.compile(
+    r"(\d{4}-\d\d-\d\d[T ]\d\d:\d\d(?::\d\d)?)(?:(?<=:\d\d:\d\d)\.(\d{1,9})\d*)?(?: ?(Z|UTC|[+-]\d\d:?\d\d)(?: UTC)?)?"
+)
 """ISO 8601, and as Go writes times: `2023-11-14 22:13:20.123456789 +0000 UTC`."""
 LIMIT_NS = 2**63
 

@@ -41,6 +41,7 @@ FLOORS = {
             "arrays",
             "config",
             "height_words",
+            "place_words",
             "locks",
             "progress",
             "provenance",

@@ -10,6 +10,7 @@ from cadence.errors import ImplausibleInputError, PartialInputError
 from pipeline.batch.outcome import LogOutcome, Status
 from pipeline.counted import counted
 from pipeline.manifest import StageResult
+from pipeline.place_words import place_words
 from pipeline.score_words import METRICS, estimator_words, value_words
 from pipeline.stores.urls import shown
 from pipeline.suspicions import few, suspicions_in
@@ -116,6 +117,8 @@ def batch_summary(outcomes: Sequence[LogOutcome], told: Collection[str] = ()) ->
             lines += [f"{outcome.task.name}: damaged: {problem}" for problem in stage.summary.get("problems", ())]
             lines += [f"{outcome.task.name}: suspected {line}" for line in few(suspicions_in(stage.summary))]
         lines += [f"{outcome.task.name}: assumed: {line}" for line in (*few(summary.get("taken", ())), *_assumptions(summary))]
+        place = place_words(*map(summary.get("frame", {}).get, ("latitude_deg", "longitude_deg")))
+        lines += [f"{outcome.task.name}: note: the zero of its metres is at {place}"] if place else []
         lines += [f"{outcome.task.name}: note: {line}" for line in summary.get("remarks", ())]
     return "\n".join([*_table(rows), *lines, *_to_open(outcomes)])
 

@@ -31,6 +31,13 @@ _ABSURD_RATIO: Final = 1000.0
 """A receiver that has just resolved its ambiguities claims to be some hundred times as exact as before, never below this."""
 
 
+_MIN_CLAIMING: Final = 8
+_AS_STATED: Final = (0.6, 1.25)
+"""Of the scatter about neighbours in what is stated: elsewhere turns of the target, or smoothing, hide what noise there is."""
+_OVERSTATED: Final = 2.0
+"""Of the same where exact positions are claimed: 1 where they are exact, 3 where they are as noisy as the others."""
+
+
 @dataclass(frozen=True, eq=False)
 class _Source:
     """The rows of a source, and its targets' tracks, each with its rows."""
@@ -98,6 +105,7 @@ def _mend_absurd(source: _Source, covariance_m2: Float64s, suspicions: Suspicion
     usual_m = float(np.median(sigma_m))
     is_absurd = (sigma_m < _LEAST_M) & (sigma_m < usual_m / _ABSURD_RATIO)
     if not is_absurd.any():
+        _mend_overstated(source, stated[sigma_m < usual_m / _SURE_RATIO], usual_m, covariance_m2, suspicions)
         return
     covariance_m2[stated[is_absurd]] = np.median(covariance_m2[stated[~is_absurd]], axis=0)
     number = int(is_absurd.sum())
@@ -107,6 +115,49 @@ def _mend_absurd(source: _Source, covariance_m2: Float64s, suspicions: Suspicion
         seen=f"{states} a standard deviation of {sigma_m[is_absurd].max():.2g} m at most, the others {usual_m:.3g} m",
         done="taken as exact as the others", setting='extract.trusted = ["covariance"]',
     )  # fmt: skip
+
+
+def _mend_overstated(
+    source: _Source, claiming: Int64s, usual_m: float, covariance_m2: Float64s, suspicions: Suspicions
+) -> None:
+    """Give the rows that claim to be far more exact than the others, and scatter as those do, the others' covariance [N, 3].
+
+    Between two neighbours with the usual noise an exact position scatters by a third of the variance of one as noisy.
+    """
+    if not _MIN_CLAIMING <= len(claiming) < len(source.rows) / 2:
+        return
+    is_claiming = np.zeros(len(covariance_m2), np.bool_)
+    is_claiming[claiming] = True
+    claimed, usual = list[Float64s](), list[Float64s]()
+    for of_track, track in source.tracks:
+        residual_m2, weight = _between(track)
+        inner = is_claiming[of_track[1:-1]]
+        claimed.append((residual_m2 / weight)[inner])
+        usual.append((residual_m2 / (1 + weight))[~inner])
+    noise = np.concatenate(usual) / (2 * usual_m**2) if usual else np.zeros(0)
+    claims = np.concatenate(claimed) / (2 * usual_m**2) if claimed else np.zeros(0)
+    if len(claims) < _MIN_CLAIMING or not _AS_STATED[0] < float(np.mean(noise)) < _AS_STATED[1]:
+        return
+    if float(np.mean(claims)) < _OVERSTATED:
+        return
+    sigma_m = float(np.sqrt(covariance_m2[claiming][:, [0, 2]].max()))
+    covariance_m2[claiming] = np.median(covariance_m2[source.rows[~is_claiming[source.rows]]], axis=0)
+    state = counted(len(claiming), f"of {len(source.rows)} detections states", f"of {len(source.rows)} detections state")
+    suspicions.add(
+        "covariance", source.name,
+        seen=f"{state} a standard deviation of {sigma_m:.2g} m at most, but scatter as the others do, with {usual_m:.3g} m",
+        done="taken as exact as the others", setting='extract.trusted = ["covariance"]',
+    )  # fmt: skip
+
+
+def _between(track: Track) -> tuple[Float64s, Float64s]:
+    """Squared distances [N - 2] of positions from the line between their neighbours, and the weight of these in variance."""
+    if len(track.time_s) < 3:
+        return np.zeros(0), np.ones(0)
+    before_s, whole_s = track.time_s[1:-1] - track.time_s[:-2], track.time_s[2:] - track.time_s[:-2]
+    share = np.divide(before_s, whole_s, out=np.full(len(before_s), 0.5), where=whole_s > 0)
+    line_m = track.position_m[:-2] + share[:, None] * (track.position_m[2:] - track.position_m[:-2])
+    return np.sum((track.position_m[1:-1] - line_m) ** 2, axis=1), share**2 + (1 - share) ** 2
 
 
 def _is_contradicted(source: _Source, covariance_m2: Float64s, suspicions: Suspicions) -> bool:

@@ -255,6 +255,13 @@ def _judge_jumps(stamps: Stamps, segments: list[Int64s]) -> Judgement:
     return Judgement(None, fault, no_row, no_row)
 
 
+def _are_of_two(ahead_s: Float64s) -> bool:
+    """Whether some stamps are of the log's clock, and all others ahead of it by one time: no message is early."""
+    is_log, is_ahead = (ahead_s >= -LATE_S) & (ahead_s <= AHEAD_S), ahead_s > AHEAD_S + _JUMP_S
+    is_either = bool((is_log | is_ahead).all()) and min(is_log.sum(), is_ahead.sum()) >= MIN_ROWS
+    return is_either and bool(np.ptp(ahead_s[is_ahead]) <= AHEAD_S)
+
+
 def _clock(stamps: Stamps) -> Clock | None:
     """The clock that most of the stamps are of; None where log times and stamps have nothing to do with each other."""
     at_ns, pace, ahead_s = int(np.median(stamps.log_time_ns)), _pace(stamps), stamps.ahead_s
@@ -262,6 +269,8 @@ def _clock(stamps: Stamps) -> Clock | None:
     spread_s = early_s - late_s
     if spread_s <= AHEAD_S:
         return Clock(at_ns, float(usual_s))
+    if _are_of_two(ahead_s):
+        return Clock(at_ns)
     if not _PACES[0] <= pace <= _PACES[1]:
         return None
     level_s = ahead_s - (pace - 1) * (stamps.log_time_ns - at_ns).astype(np.float64) * 1e-9

@@ -16,6 +16,7 @@ class FieldReader:
         self.paths = [parse_path(text) for text in texts]
         self.is_needed = is_needed
         self.is_found = False
+        self.num_lost = 0  # texts that say something which `convert` does not understand
         self._problem: tuple[str, MissingFieldError] | None = None
         self._convert = convert
         self._order = list(range(len(self.paths)))
@@ -36,7 +37,10 @@ class FieldReader:
                 continue
             self.is_found = True
             if self._convert is not None:
-                values = {place: self._convert(value) for place, value in values.items()}
+                stated, values = values, {place: self._convert(value) for place, value in values.items()}
+                self.num_lost += sum(
+                    values[place] is None and isinstance(text, str) and text.strip() != "" for place, text in stated.items()
+                )
                 if values and all(value is None for value in values.values()):
                     unfilled = unfilled or values
                     continue

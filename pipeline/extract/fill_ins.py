@@ -19,6 +19,10 @@ _MAX_PLACES: Final = 16
 _MAX_LATITUDE_DEG: Final = 90.0
 _MIN_APART_M: Final = 10.0
 _MIN_JUMP_MPS: Final = 10.0
+_MIN_HELD: Final = 5
+_MIN_HELD_M: Final = 1e4
+_MAX_REACH_MPS: Final = 1e3
+"""A receiver may begin with the place of its maker, or the last one that it knew, and be elsewhere with its first fix."""
 _JUMP_RATIO: Final = 10.0
 """A robot that starts at 0, 0 goes on from there. What comes there ten times as fast as it ever moves was not there."""
 
@@ -27,7 +31,7 @@ def without_fill_ins(rows: Positions, role: str, suspicions: Suspicions) -> Posi
     """The rows of one reader without those at 0, 0 and the like, which are told as a suspicion."""
     if len(rows) == 0 or not suspicions.looks_for("place"):
         return rows
-    is_fill_in = np.zeros(len(rows), np.bool_)
+    is_fill_in = _held_at_start(rows)
     for first, second in _candidates(rows):
         is_value = (rows.first == first) & (rows.second == second)
         for of_agent in _by_agent(rows, is_value):
@@ -62,6 +66,24 @@ def _candidates(rows: Positions) -> list[tuple[float, float]]:
     known = [place for place in counts if place in _FILL_INS]
     written = [place for place, count in counts.items() if count >= _MIN_REPEATS and place not in known]
     return known + (written if len(written) <= _MAX_PLACES else [])
+
+
+def _held_at_start(rows: Positions) -> Bools:
+    """Which rows [N] in degrees repeat an agent's first position to the last digit, from where nothing gets to its others."""
+    found = np.zeros(len(rows), np.bool_)
+    if not rows.is_geodetic[0]:
+        return found
+    places = np.column_stack([rows.first, rows.second])
+    for of_agent in (*rows.agents.rows(), np.flatnonzero(rows.agents.number < 0)):
+        is_held = (places[of_agent[:_MIN_HELD]] == places[of_agent[:1]]).all(axis=1)
+        if is_held.sum() < _MIN_HELD:
+            continue
+        step_m = DEGREE_M * np.hypot(*(places[of_agent] - places[of_agent[0]]).T)
+        num = int((step_m > 0).argmax())
+        way_s = (rows.time_ns[of_agent[num]] - rows.time_ns[of_agent[num - 1]]) * 1e-9
+        least_m = max(_MIN_HELD_M, _MAX_REACH_MPS * way_s)
+        found[of_agent[:num]] = bool((step_m[num:] > least_m).all()) and num > 0
+    return found
 
 
 def _by_agent(rows: Positions, is_value: Bools) -> Iterator[Bools]:

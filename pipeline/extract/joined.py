@@ -23,6 +23,8 @@ _FIXED_WORDS: Final = {
 """Words in the names of frames that stand still, by convention."""
 _BODIES: Final = {"base_link", "base_footprint", "base", "body", "chassis", "vehicle"}
 """Frames that move with a vehicle, by REP 105 and custom."""
+_NUMBERED: Final = re.compile(r"(.+)_(\d+)(\.mcap.*)")
+"""Names of the parts of a split recording."""
 _MAX_NAMED: Final = 6
 _MIN_MOVED_M: Final = 30.0
 """What a receiver that stands scatters by stays below."""
@@ -30,17 +32,24 @@ _MIN_MOVED_M: Final = 30.0
 
 def check_joined(
     rows: Mapping[str, Positions], role: str, transforms: LogTransforms, read_tree: Callable[[], TransformTree],
-    log: MissionLog, suspicions: Suspicions,
+    log: MissionLog, suspicions: Suspicions, framed: Collection[str] = (),
 ) -> None:  # fmt: skip
     """Refuse rows of `role` in metres of a frame that none of the log's transforms joins, and of a camera's optical frame.
 
     Raises `InputError` with the way out. A vehicle's frame in a log without transforms is told as a suspicion, and so is any
-    frame beside a sensor that moves in another.
+    frame beside a sensor that moves in another. Messages of the topics `framed` have a field for the frame; where it is empty
+    and something moves, that is told as well.
     """
     names = sorted({name for name in _metric_frames(rows[role]) if name and not _stands_still(name)})
-    if not names or not suspicions.looks_for("place"):
+    unnamed = _without_frame(rows[role], framed)
+    if not (names or unnamed) or not suspicions.looks_for("place"):
         return
     tree = read_tree()
+    if unnamed and (mover := _mover(rows["poses"], [""]) or _moving(tree)):
+        suspicions.add(
+            "place", ", ".join(unnamed), seen=f"the messages name no frame, and {mover}", done="taken as places of the world",
+            setting='extract.frame = "map" (they are), or let the messages say whose coordinates they are',
+        )  # fmt: skip
     worlds = {name: tree.world(name) for name in (*tree.links, *(link.parent for link in tree.links.values()))}
     are_still = {world for world in worlds.values() if _stands_still(world)}
     apart = [name for name in names if name not in worlds or (are_still and worlds[name] not in are_still)]
@@ -72,6 +81,23 @@ def _metric_frames(rows: Positions) -> set[str]:
     return {rows.frames.names[number] for number in np.unique(rows.frames.number[~rows.is_geodetic]).tolist()}
 
 
+def _without_frame(rows: Positions, framed: Collection[str]) -> list[str]:
+    """Which of the topics `framed` hold metres of a frame without a name."""
+    if "" not in rows.frames.names or not framed:
+        return []
+    is_open = (rows.frames.number == rows.frames.names.index("")) & ~rows.is_geodetic
+    return sorted({rows.topics.names[number] for number in np.unique(rows.topics.number[is_open]).tolist()} & set(framed))
+
+
+def _moving(tree: TransformTree) -> str:
+    """Which frame moves in another one; empty where none does."""
+    for link in tree.links.values():
+        way_m = float(np.hypot(*np.ptp(link.translation_m[:, :2], axis=0)))
+        if way_m > _MIN_MOVED_M:
+            return f"{link.child} moves by {way_m:.4g} m in {link.parent}"
+    return ""
+
+
 def _mover(poses: Positions, names: Collection[str]) -> str:
     """Which sensor moves, in another frame than `names`; empty where none does."""
     for topic, of_topic in zip(poses.topics.names, poses.topics.rows(), strict=True):
@@ -99,4 +125,9 @@ def _way_out(frame: str, log: MissionLog) -> str:
     if log.path in recorded_parts(folder) and (others or absent):
         where = f"run the folder {folder}" if others else f"find {', '.join(map(str, absent))}"
         return f"this is a part of a split recording, whose first part alone has the static transforms: {where}; or {stated}"
+    if numbered := _NUMBERED.fullmatch(log.path.name):
+        beside = folder / f"{numbered[1]}_0{numbered[3]}"
+        if int(numbered[2]) > 0 and beside.is_file():
+            made = f"`ros2 bag reindex {folder}` writes the metadata.yaml by which the folder is one recording"
+            return f"{beside.name} beside it may be its first part, with the static transforms: {made}; or {stated}"
     return f"record its transforms with it; or {stated}"

@@ -79,7 +79,8 @@ def rows_in_frame(
     placing = Placing(config.frame, limits)
     read_tree = partial(transforms.read, clock)
     if config.frame is None:
-        check_joined(rows, primary, transforms, read_tree, log, suspicions)
+        framed = {r.channel.topic for r in readers if "frame_id" in r.fields and r.fields["frame_id"].is_found}
+        check_joined(rows, primary, transforms, read_tree, log, suspicions, framed)
     rows = bring_together(rows, primary, placing, read_tree, counts)
     _check_any(primary, rows[primary], counts, suspicions)
     rows = {role: in_enu(positions) for role, positions in rows.items()}

@@ -4,6 +4,7 @@ A name is believed as long as nothing contradicts it. What does, is said as a su
 """
 
 import itertools
+import re
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from typing import Final
@@ -38,6 +39,8 @@ _CLASSES: Final = {
     "horse", "deer", "cow", "sheep", "cone", "object", "obstacle", "other", "background",
 }  # fmt: skip
 """Kinds of targets, as detectors are trained for them."""
+_CLASS_WORDS: Final = {"type", "class", "label", "category", "human", "adult", "movable", "static", "small", "large", "motor"}
+"""What stands beside such a kind in the names of labels: `vehicle.car`, `TYPE_PEDESTRIAN`."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +82,7 @@ def _faults(rows: Positions, is_stated: bool) -> Iterator[tuple[Bools, str]]:
     names = rows.agents.names
     for is_chosen, why in (
         ([_is_fill_in(name) for name in names], "what stands where nothing was filled in"),
-        ([not is_stated and name.lower() in _CLASSES for name in names], "what was seen, not who"),
+        ([not is_stated and _is_class(name) for name in names], "what was seen, not who"),
     ):
         chosen = list(itertools.compress(names, is_chosen))
         if chosen:
@@ -93,6 +96,11 @@ def _faults(rows: Positions, is_stated: bool) -> Iterator[tuple[Bools, str]]:
 def _is_fill_in(name: str) -> bool:
     digits = name.lower().replace("-", "").removeprefix("0x")
     return name in _FILL_INS or (len(digits) >= 8 and digits in ("0" * len(digits), "f" * len(digits)))
+
+
+def _is_class(name: str) -> bool:
+    words = [word for word in re.split(r"[^a-z0-9]+", name.lower()) if word]
+    return not _CLASSES.isdisjoint(words) and _CLASSES.union(_CLASS_WORDS).issuperset(words)
 
 
 def _are_fresh(rows: Positions) -> bool:

@@ -71,6 +71,7 @@ def read_positions(
     for reader in readers:
         reader.check()
         counts.update(reader.counts)
+        counts["unread_stamps"] += reader.fields["time"].num_lost if "time" in reader.fields else 0
     return counts
 
 

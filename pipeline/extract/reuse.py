@@ -20,6 +20,8 @@ from pipeline.suspicions import Suspicions, listed
 _MAX_ODD: Final = 0.3
 """Of the steps of a name: noise alone makes a target seem to leave and come back in one step of twelve."""
 _MIN_ROWS: Final = 4
+_MAX_DIGITS: Final = 5
+"""Of a number that a tracker counts; those of ships and aircraft have more."""
 _SETTING: Final = "has_identity (true: names are believed, false: none is) in its [[extract.detections]]"
 
 
@@ -101,7 +103,8 @@ def _renamed(
     if odd > _MAX_ODD * len(rows):
         told.odd[name] = len(rows)
         return np.full(len(rows), None, dtype=object)
-    piece, jump = pieces_of(track[rows], tolerance_s)
+    is_counted = name.rpartition("/")[2].isdecimal() and len(name.rpartition("/")[2]) <= _MAX_DIGITS
+    piece, jump = pieces_of(track[rows], tolerance_s, is_counted)
     if jump is None:
         return None
     told.jumps[name] = jump

@@ -20,6 +20,9 @@ _MAX_RATIO: Final = 3.0
 _MIN_JUMP_M: Final = 100.0
 _MIN_JUMP_MPS: Final = 100.0
 """A receiver that finds its fix again may jump by tens of metres from one second to the next."""
+_MIN_REUSE_M: Final = 20.0
+_REUSE_RATIO: Final = 10.0
+"""Names that a tracker counts are given out anew, those of receivers are not: a shorter jump is enough, if it is fast."""
 _SIGMAS: Final = 4.0
 _SCATTERS: Final = 10.0
 _STEPS: Final = 3.0
@@ -152,16 +155,17 @@ def _are_forced(track: Track, sigma_m: Float64s, is_return: Bools, lag: int, tol
     return found
 
 
-def pieces_of(track: Track, tolerance_s: float) -> tuple[Int64s, Jump | None]:
+def pieces_of(track: Track, tolerance_s: float, is_counted: bool = False) -> tuple[Int64s, Jump | None]:
     """The number [N] of the target that each row of a track is of, from 0, and the jump between two that is longest.
 
-    After a jump comes what was there before another one, if it can, else a new target.
+    After a jump comes what was there before another one, if it can, else a new target. `is_counted`: its name is a number
+    that a tracker gave out.
     """
     is_moment = np.diff(track.time_s, prepend=-np.inf) > tolerance_s
     moments = track[is_moment]
-    if not _is_far(np.abs(np.diff(moments.place)), np.diff(moments.time_s)).any():
+    if not _is_far(np.abs(np.diff(moments.place)), np.diff(moments.time_s), is_counted).any():
         return np.zeros(len(track), np.int64), None
-    motion = _Motion(moments)
+    motion = _Motion(moments, is_counted)
     jumps = motion.jumps()
     if not jumps.any():
         return np.zeros(len(track), np.int64), None
@@ -178,8 +182,8 @@ def pieces_of(track: Track, tolerance_s: float) -> tuple[Int64s, Jump | None]:
 class _Motion:
     """How a track moves from moment to moment: steps [N - 1], and the speeds around them."""
 
-    def __init__(self, track: Track) -> None:
-        self.track = track
+    def __init__(self, track: Track, is_counted: bool) -> None:
+        self.track, self.is_counted = track, is_counted
         self.step_s, self.step_m = np.diff(track.time_s), np.abs(np.diff(track.place))
         self.speed_mps = self.step_m / self.step_s
         self.usual_mps = float(np.quantile(self.speed_mps, 0.75)) if len(self.speed_mps) else 0.0
@@ -214,8 +218,9 @@ class _Motion:
         # To leave the speed around, and to come back to it at the other end.
         acceleration_mps2 = 4 * (step_m - around_mps * step_s - noise_m) / step_s**2
         is_fast = (acceleration_mps2 > _MAX_ACCELERATION_MPS2) & (step_m > _MAX_RATIO * around_mps * step_s)
-        return is_fast & _is_far(step_m, step_s)
+        is_leap = is_fast & (step_m > _REUSE_RATIO * around_mps * step_s) & self.is_counted
+        return (is_fast & _is_far(step_m, step_s, False)) | (is_leap & _is_far(step_m, step_s, True))
 
 
-def _is_far(step_m: Float64s, step_s: Float64s) -> Bools:
-    return np.asarray((step_m > _MIN_JUMP_M) | (step_m > _MIN_JUMP_MPS * step_s))
+def _is_far(step_m: Float64s, step_s: Float64s, is_counted: bool) -> Bools:
+    return np.asarray((step_m > (_MIN_REUSE_M if is_counted else _MIN_JUMP_M)) | (step_m > _MIN_JUMP_MPS * step_s))

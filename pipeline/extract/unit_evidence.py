@@ -121,8 +121,8 @@ def _of_whole_numbers(rows: Positions, seen: str) -> Evidence | None:
         return None
     if np.median(latitude) > _MAX_SCALED_6[0] or np.median(longitude) > _MAX_SCALED_6[1]:
         return Evidence(f"{seen}, whole numbers", "1e-7 deg", "read as 1e-7 degrees", 'unit = "1e-7 deg" or "deg"')
-    seen += ", whole numbers: 1e-7 or 1e-6 degrees, or parts of minutes"
-    return Evidence(seen, "left out", "left out", 'unit = "1e-7 deg", or latitude = "PATH.@mul(1e-6)" and so on,')
+    seen += ", whole numbers: 1e-7 or 1e-6 degrees, parts of minutes, or metres (UTM)"
+    return Evidence(seen, "left out", "left out", 'unit = "1e-7 deg", latitude = "PATH.@mul(1e-6)" and so on, or x and y,')
 
 
 def _of_far_numbers(rows: Positions, seen: str) -> Evidence | None:
@@ -138,7 +138,8 @@ def _of_far_numbers(rows: Positions, seen: str) -> Evidence | None:
         return Evidence(seen, "ddmm.mm", "read as degrees and minutes", 'unit = "ddmm.mm" or "deg"')
     if share_off >= 0.5 or (speed_mps or 0.0) > _MAX_DEGREE_SPEED_MPS:
         seen += "" if speed_mps is None else f", which would move at {speed_mps:.3g} m/s"
-        return Evidence(f"{seen}, may be metres", "left out", "left out", 'x and y, or unit = "deg"')
+        minutes = 'unit = "ddmm.mm" (degrees and minutes), ' * bool(((latitude % 100 < 60) & (longitude % 100 < 60)).all())
+        return Evidence(f"{seen}, may be metres", "left out", "left out", f'x and y, {minutes}or unit = "deg"')
     return None
 
 
@@ -177,7 +178,7 @@ def _of_far_metres(rows: Positions, radius_m: Float64s) -> Evidence | None:
     if (both % 1 == 0).all() and np.median(radius_m) > _MAX_PLANE_M and both.max() <= _MAX_SCALED[1]:
         seen = f"x {_range(rows.first)}, y {_range(rows.second)}, whole numbers, which may be 1e-7 degrees"
         return Evidence(seen, "left out", "left out", 'latitude and longitude with unit = "1e-7 deg", or unit = "m"')
-    speed_mps = _progress_mps(rows)
+    speed_mps = _progress_mps(rows, float(np.hypot(np.ptp(rows.first), np.ptp(rows.second))))
     if speed_mps > _MAX_METRE_SPEED_MPS:
         seen = f"x {_range(rows.first)}, y {_range(rows.second)}, which move on at {speed_mps:.4g} m/s: may be millimetres"
         return Evidence(seen, "as they are", "used as metres", 'x = "PATH.@mul(0.001)" and so on, or unit = "m",')
@@ -224,12 +225,15 @@ def _is_straight(rows: Positions, way_m: float) -> bool:
     return bool(way_m > _MOST * steps_m.sum() and np.quantile(steps_m, 1 - _MOST) > np.median(steps_m) / 2)
 
 
-def _progress_mps(rows: Positions) -> float:
-    """How fast the target with most rows gets on over half of its rows; 0 where that cannot be said."""
+def _progress_mps(rows: Positions, way_m: float) -> float:
+    """How fast the target with most rows gets on over half of its rows; 0 where that cannot be said.
+
+    Rows without a name are one target's where they are a smooth way of `way_m`.
+    """
     agent = rows.agents.number
-    if (agent < 0).any():
+    if (agent < 0).any() and ((agent >= 0).any() or not _is_smooth(rows, way_m)):
         return 0.0
-    track = np.flatnonzero(agent == np.bincount(agent).argmax())
+    track = np.flatnonzero(agent == np.bincount(agent + 1).argmax() - 1)
     track = track[np.argsort(rows.time_ns[track], kind="stable")]
     half = len(track) // 2
     if half < _MIN_ROWS:

@@ -11,6 +11,7 @@ import numpy as np
 from cadence.arrays import Bools
 from cadence.errors import ConfigError
 from pipeline.extract.covariances import rotated
+from pipeline.extract.mixed_units import in_one_reading
 from pipeline.extract.positions import Positions
 from pipeline.extract.unit_evidence import (
     MIN_RADIUS_M,
@@ -50,7 +51,7 @@ def in_true_units(source: SourceConfig, role: str, rows: Positions, suspicions: 
     some = rows[:: 1 + len(rows) // _MAX_ROWS]
     found = of_degrees(some) if is_geodetic else of_metres(some)
     if found is None:
-        return rows
+        return in_one_reading(rows, role, suspicions) if is_geodetic else rows
     setting = f"{found.setting} in its [[extract.{role}]]"
     suspicions.add("place", str(rows.topic[0]), seen=found.seen, done=found.done, setting=setting)
     return _made(found.made, rows)

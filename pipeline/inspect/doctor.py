@@ -17,6 +17,7 @@ from pipeline.logs.health import utc
 from pipeline.logs.reader import MissionLog, open_parts
 from pipeline.measurement_words import measurement_words
 from pipeline.missions import find_missions
+from pipeline.place_words import place_words
 from pipeline.progress import Progress
 from pipeline.stores.urls import is_url
 from pipeline.suspicions import few, suspicions_in
@@ -185,7 +186,9 @@ def _use_lines(diagnosis: Diagnosis) -> list[str]:
         return [f"nothing: {diagnosis.no_use}"]
     use = diagnosis.use
     agents = counted(use["num_agents"], "agent") if use["num_agents"] else "agents that are not named"
-    counts = [f"{counted(use['num_detections'], 'detection')} of {agents}{_topics(use, 'detections')}"]
+    place = place_words(use["frame"]["latitude_deg"], use["frame"]["longitude_deg"])
+    around = f", around {place}" if place else ""
+    counts = [f"{counted(use['num_detections'], 'detection')} of {agents}{_topics(use, 'detections')}{around}"]
     if use["num_unknown_origin"] and use["num_agents"]:
         counts.append(
             counted(

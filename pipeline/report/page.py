@@ -8,6 +8,7 @@ from importlib import resources
 from string import Template
 
 from pipeline.clock import Clock, duration
+from pipeline.place_words import place_words
 from pipeline.report.analysis import Analysis, Moment, share_of_steps
 from pipeline.report.answers import answers_section
 from pipeline.report.health import health_section
@@ -23,7 +24,6 @@ from pipeline.report.suspicions import suspicions_section
 from pipeline.report.truth import truth_section
 from pipeline.report.verdict import verdict_section
 from pipeline.stream_words import stream_words
-from pipeline.tables import Frame
 from pipeline.tracks import UNKNOWN_AGENT
 
 READING = (
@@ -107,7 +107,8 @@ def _header(mission: Mission) -> str:
     clock = Clock(mission.log_start_ns, mission.log_end_ns)
     length = duration((mission.log_end_ns - mission.log_start_ns) / 1e9)
     words = ["Hypothesis tracks from sparse detections", clock.range(), length]
-    words += [f"zero of its metres at {_latitude_longitude(mission.frame)}"] if mission.frame.is_georeferenced else []
+    place = place_words(mission.frame.latitude_deg, mission.frame.longitude_deg)
+    words += [f"zero of its metres at {place}"] if place else []
     line = text(" · ".join(words))
     return f"<header><h1>{text(mission.name)}</h1><p>{line}</p>{_thinned(mission)}</header>\n"
 
@@ -171,12 +172,6 @@ def _facts(mission: Mission) -> list[tuple[str, str, str]]:
         ("Windows", f"{len(mission.origins_ns):,}", f"{duration(fan.origin_index * step_s)} back, {duration(ahead_s)} ahead"),
         ("Hypotheses a window", f"{max(counts):,}", f"{sum(counts):,} tracks in all"),
     ]
-
-
-def _latitude_longitude(frame: Frame) -> str:
-    latitude_deg, longitude_deg = frame.latitude_deg or 0.0, frame.longitude_deg or 0.0
-    north, east = "S" if latitude_deg < 0 else "N", "W" if longitude_deg < 0 else "E"
-    return f"{abs(latitude_deg):.4f}° {north}, {abs(longitude_deg):.4f}° {east}"
 
 
 def _reading(mission: Mission) -> str:

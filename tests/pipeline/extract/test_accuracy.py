@@ -158,6 +158,25 @@ def test_a_few_absurdly_exact_detections_are_as_exact_as_the_others(tmp_path: Pa
     assert trusting.summary["suspicions"] == [] and trusting.detections["cov_xx_m2"].to_pylist().count(1e-12) == 5
 
 
+def test_claims_of_centimetres_that_scatter_as_all_others_do(tmp_path: Path) -> None:
+    (suspicion,) = run(tmp_path, mixed(1e-4, 25.0, 30)).summary["suspicions"]
+    assert suspicion["seen"].startswith("30 of 240 detections state a standard deviation of 0.01 m at most, but scatter as the")
+    assert set(run(tmp_path, mixed(1e-4, 25.0, 30)).detections["cov_xx_m2"].to_pylist()) == {25.0}
+
+
+@pytest.mark.parametrize("way", [STRAIGHT, CIRCLE, 20.0 * np.column_stack([np.sin(SECONDS), np.cos(SECONDS)])])
+@pytest.mark.parametrize("num_few", [12, 100])
+def test_claims_of_centimetres_that_hold(tmp_path: Path, way: np.ndarray, num_few: int) -> None:
+    """Also in one stretch, and of what turns sharply."""
+    is_few = np.isin(np.arange(240), np.arange(50, 50 + num_few) if num_few > 50 else np.arange(0, 240, 20))
+    places = way + noise(5.0) * ~is_few[:, None]
+    log = [
+        detection(float(i), *place, agent_id="a", covariance=[each, 0.0, 0.0, each])
+        for i, (place, each) in enumerate(zip(places.tolist(), np.where(is_few, 1e-4, 25.0).tolist(), strict=True))
+    ]
+    assert run(tmp_path, log).summary["suspicions"] == []
+
+
 @pytest.mark.parametrize(
     ("few_m2", "many_m2", "num_few"), [(1e-4, 25.0, 20), (0.01, 25.0, 5), (1e-8, 1e-8, 5), (1e-8, 1e-6, 5)]
 )

@@ -79,6 +79,8 @@ BROKEN = {
     "first ones unset": (stamped(np.where(LOG_S < 2, START_S + LOG_S, 50.0 + LOG_S)), "2 of 120 stamps are unset", NUM - 2),
     "one of the future": (stamps(np.where(LOG_S == 7, 1e9, 0.0)), "1 of 120 stamps", NUM - 1),
     "every other an hour late": (stamps(np.where(LOG_S % 2 == 0, -3600.0, 0.0)), "60 of 120 stamps", 60),
+    "every other by the time of satellites": (stamps(np.where(LOG_S % 2 == 0, 37.0, 0.0)), "60 of 120 stamps", 60),
+    "every third an hour early": (stamps(np.where(LOG_S % 3 == 0, 3600.0, 0.0)), "40 of 120 stamps", 80),
     "every other an hour early": (stamps(np.where(LOG_S % 2 == 0, 3600.0, 0.0)), "60 of 120 stamps", 60),
 }
 

@@ -42,6 +42,21 @@ def test_metres_that_look_written(tmp_path: Path, place: tuple[float, float]) ->
     assert found.summary["num_detections"] == 50 and len(found.summary["suspicions"]) == 1
 
 
+@pytest.mark.parametrize("held", [5, 30])
+def test_a_receiver_that_begins_at_the_place_of_its_maker(tmp_path: Path, held: int) -> None:
+    found = run(tmp_path, [*(fix(float(i), 31.2304, 121.4737) for i in range(held)), *drive(60, held)])
+    (suspicion,) = found.summary["suspicions"]
+    assert found.summary["num_detections"] == 60
+    assert f"{held} of {held + 60} positions are at 31.2304, 121.474" in suspicion["seen"]
+
+
+def test_a_ship_that_is_moored_in_another_country(tmp_path: Path) -> None:
+    """Ships without names: the first stays, and is seen again."""
+    moored = [fix(float(i), 50.5, 3.5, "/ais") for i in (*range(6), 20)]
+    rows = [*moored, *(fix(i + 0.5, 51.5 + 1e-4 * i, 1.5, "/ais") for i in range(6, 40))]
+    assert run(tmp_path, by_time(rows), detections=[{"topic": "/ais"}]).summary["suspicions"] == []
+
+
 def test_what_is_off_the_earth_is_counted(tmp_path: Path) -> None:
     rows = [fix(float(i), *((91.0, 181.0) if i % 2 else (1e7, 1e7))) if 20 <= i < 30 else drive(1, i)[0] for i in range(60)]
     found = run(tmp_path, rows)

@@ -48,6 +48,14 @@ def test_a_frame_that_no_transform_joins(tmp_path: Path) -> None:
     assert run(mk(tmp_path / "c"), [*DRIVE, *seen("radar")], trusted=["place"]).frame.frame_id == "radar"
 
 
+def test_a_part_without_metadata_beside_the_first_one(tmp_path: Path) -> None:
+    for part in range(2):
+        write_log(tmp_path / f"run_{part}.mcap", [*DRIVE, *seen("radar")])
+    for part, words in ((0, "record its transforms"), (1, r"run_0.mcap beside it may be its first part.* `ros2 bag reindex")):
+        with pytest.raises(InputError, match=words):
+            write_tables(open_log(tmp_path / f"run_{part}.mcap"), mk(tmp_path / f"{part}"), ExtractConfig(), QUIET)
+
+
 def test_a_tree_of_its_own(tmp_path: Path) -> None:
     """The radar's antenna has a mount, but nothing says where the mount is."""
     mount = transform(0.0, "radar", "antenna", topic="/tf_static")
@@ -85,6 +93,18 @@ def test_a_sensor_beside_a_vehicle_that_moves(tmp_path: Path) -> None:
     assert suspicion["subject"] == "frame radar" and "/ownship/pose moves by 95 m" in suspicion["seen"]
     for speed_mps, frame in ((0.0, "map"), (5.0, "radar")):
         assert run(mk(tmp_path / f"{frame}"), beside(speed_mps, frame)).summary["suspicions"] == []
+
+
+def test_a_frame_without_a_name_beside_what_moves(tmp_path: Path) -> None:
+    drive = [transform(float(i), "odom", "base_link", 3.0 * i) for i in range(20)]
+    both = sorted([*drive, *seen("")], key=lambda row: row.time_s)
+    (suspicion,) = run(mk(tmp_path / "a"), both).summary["suspicions"]
+    assert suspicion["subject"] == "/radar/contacts"
+    assert suspicion["seen"] == "the messages name no frame, and base_link moves by 57 m in odom"
+    assert run(mk(tmp_path / "b"), both, frame="map").summary["suspicions"] == []
+    assert run(mk(tmp_path / "c"), seen("")).summary["suspicions"] == []
+    slow = sorted([*DRIVE, *seen("")], key=lambda row: row.time_s)  # 19 m: it may as well stand
+    assert run(mk(tmp_path / "d"), slow).summary["suspicions"] == []
 
 
 def test_what_is_in_a_frame_of_the_earth_joins_the_map(tmp_path: Path) -> None:

@@ -30,6 +30,11 @@ def test_exact_forms(value: object) -> None:
     assert stamp_ns(value) == EXPECTED
 
 
+def test_a_time_without_seconds() -> None:
+    assert stamp_ns("2023-11-14T22:13Z") == stamp_ns("2023-11-14 22:13") == EXPECTED // (60 * 10**9) * 60 * 10**9
+    assert stamp_ns("2023-11-14T22:13.5Z") is None
+
+
 @pytest.mark.parametrize(("value", "factor"), [(1_700_000_000.5, 1), (1_700_000_000_500, 1e3), (1_700_000_000_500_000, 1e6)])
 def test_numbers_are_told_apart_by_size(value: float, factor: float) -> None:
     assert stamp_ns(value) == 1_700_000_000_500_000_000

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from fixtures.small_logs import Row, fix, stamp
 from pyproj import Transformer
-from test_extract import fails, run
+from test_extract import fails, mk, run
 
 from cadence.errors import ConfigError, InputError
 from pipeline.frames import to_geodetic
@@ -90,7 +90,7 @@ def test_a_slow_ship_off_ghana_with_the_decimals_of_degrees(tmp_path: Path) -> N
 @pytest.mark.parametrize("scale", [1e5, 1e6, 600_000.0])
 def test_whole_numbers_of_which_power_nobody_knows(tmp_path: Path, scale: float) -> None:
     rows = [fix(float(i), round((48.1 + 1e-4 * i) * scale), round(11.6 * scale)) for i in range(30)]
-    fails(tmp_path, rows, InputError, "whole numbers: 1e-7 or 1e-6 degrees, or parts of minutes; left out")
+    fails(tmp_path, rows, InputError, r"whole numbers: 1e-7 or 1e-6 degrees, parts of minutes, or metres \(UTM\); left out")
     told = run(tmp_path, rows, detections=[{"topic": "/contacts/{agent}", "unit": "1e-7 deg"}])
     assert told.summary["suspicions"] == [] and where(told)[0] == pytest.approx(48.1 * scale / 1e7, rel=1e-3)
 
@@ -238,6 +238,45 @@ def test_millimetres_are_named(tmp_path: Path) -> None:
     assert "which move on at 1500 m/s: may be millimetres" in suspicion["seen"]
     told = run(tmp_path, metric(way), detections=[{"topic": "/contacts/{agent}", "unit": "m"}])
     assert told.summary["suspicions"] == []
+
+
+def test_millimetres_of_the_only_target_are_named(tmp_path: Path) -> None:
+    ways = np.column_stack([10_000.0 * np.arange(60), 4000.0 * np.arange(60)])
+    rows = [Row("/target/detections", row.schema, row.time_s, row.message) for row in metric(ways)]
+    assert "may be millimetres" in run(mk(tmp_path / "a"), rows).summary["suspicions"][0]["seen"]
+    turns = np.random.default_rng(0).uniform(0, 1e5, (60, 2))  # several targets far from each other, in turn
+    several = [Row("/target/detections", row.schema, row.time_s, row.message) for row in metric(turns)]
+    assert run(mk(tmp_path / "b"), several).summary["suspicions"] == []
+
+
+@pytest.mark.parametrize(
+    ("reading", "words", "num"),
+    [
+        (lambda place: np.radians(place), "if they were radians", 90),
+        (lambda place: np.rint(place * 1e7), "if they were 1e-7 degrees", 90),
+        (lambda place: place[::-1], "if they were exchanged", 60),
+        (lambda place: place * [1, -1], "if they were of the other side of Greenwich", 60),
+        (lambda place: place + 0.5, "", 90),
+        (lambda place: place + 20.0, "", 90),
+    ],
+)
+@pytest.mark.parametrize("is_first", [True, False])
+def test_a_source_that_changes_in_its_midst(tmp_path: Path, reading: Any, words: str, num: int, is_first: bool) -> None:
+    """A third of it is in another reading: at its beginning, or at its end."""
+    places = np.column_stack([np.full(90, 48.1), 11.6 + 1e-4 * np.arange(90)])
+    other = range(30) if is_first else range(60, 90)
+    rows = [fix(float(i), *(reading(place) if i in other else place), topic="/target/fix") for i, place in enumerate(places)]
+    found = run(tmp_path, rows)
+    assert found.summary["num_detections"] == num
+    assert [words in suspicion["seen"] for suspicion in found.summary["suspicions"]] == [True] * bool(words)
+    if words:
+        assert where(found) == pytest.approx((48.1, 11.6045), abs=0.01) and max(east_and_north(found)) < 700.0
+
+
+def test_targets_on_both_sides_of_greenwich(tmp_path: Path) -> None:
+    """Ships without names, seen in turn, are no target that leaps."""
+    rows = [fix(float(i), 50.0 + 1e-4 * i, 3.0 if i % 2 else -3.0, topic="/ais/detections") for i in range(40)]
+    assert run(tmp_path, rows).summary["suspicions"] == []
 
 
 def test_noise_of_a_fast_source_is_no_speed(tmp_path: Path) -> None:
