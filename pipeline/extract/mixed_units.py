@@ -49,10 +49,10 @@ def in_one_reading(rows: Positions, role: str, suspicions: Suspicions) -> Positi
     if not len(able) or min(is_far.sum(), (~is_far).sum()) < _MIN_ROWS:
         return rows
     groups = [told[~is_far], told[is_far]]
-    turns = _leaps(rows[told], is_far)
+    turns = _leaps(rows[told], np.asarray(is_far))
     for one, other in (groups, groups[::-1]) if turns else ():
         centre = np.median(places[other], axis=0)
-        for word, made in (_UNITS | (_MIRRORS if turns <= _MAX_TURNS else {})).items():
+        for word, made in {**_UNITS, **(_MIRRORS if turns <= _MAX_TURNS else {})}.items():
             if not (np.abs(made(places[one]) - centre) < _NEAR_DEG).all():
                 continue
             is_mirror = word in _MIRRORS

@@ -239,8 +239,8 @@ def _progress_mps(rows: Positions, way_m: float) -> float:
     if half < _MIN_ROWS:
         return 0.0
     before, after = track[: len(track) - half], track[half:]
-    way_m = np.hypot(rows.first[after] - rows.first[before], rows.second[after] - rows.second[before])
-    return float(np.median(way_m / np.maximum((rows.time_ns[after] - rows.time_ns[before]) * 1e-9, 1e-9)))
+    gone_m = np.hypot(rows.first[after] - rows.first[before], rows.second[after] - rows.second[before])
+    return float(np.median(gone_m / np.maximum((rows.time_ns[after] - rows.time_ns[before]) * 1e-9, 1e-9)))
 
 
 def _speed_mps(rows: Positions, unit_m: float) -> float | None:
