@@ -27,7 +27,7 @@ def stream_words(record: Mapping[str, Any]) -> str:
     if counts["detection"] is not None:
         parts.append(f"an agent is detected in {_percent(counts['detection'])} of the scans")
     if counts["mean_gap_s"] is not None:
-        parts.append(f"once in {counts['mean_gap_s']:.3g} s")
+        parts.append(f"an agent is seen once in {counts['mean_gap_s']:.3g} s")
     return "detections without identity: " + ", ".join(parts)
 
 

@@ -12,7 +12,7 @@ COUNTS = {
 def test_what_was_found() -> None:
     assert stream_words({"counts": COUNTS, "stated": []}) == (
         "detections without identity: 4 agents (probability 0.93, 95 %: 4 to 5), 20.0% (15.0% to 25.0%) of the detections are "
-        "clutter, an agent is detected in 20.0% (15.0% to 25.0%) of the scans, once in 50 s"
+        "clutter, an agent is detected in 20.0% (15.0% to 25.0%) of the scans, an agent is seen once in 50 s"
     )
 
 
