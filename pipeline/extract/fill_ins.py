@@ -19,6 +19,10 @@ _MAX_PLACES: Final = 16
 _MAX_LATITUDE_DEG: Final = 90.0
 _MIN_APART_M: Final = 10.0
 _MIN_JUMP_MPS: Final = 10.0
+_MIN_TIMES: Final = 3
+_MAX_SHARE: Final = 0.3
+_FAR: Final = 0.1
+"""Of several targets without names one may stand at 0, 0, but then it is seen there for long, or others pass."""
 _MIN_HELD: Final = 5
 _MIN_HELD_M: Final = 1e4
 _MAX_REACH_MPS: Final = 1e3
@@ -39,6 +43,12 @@ def without_fill_ins(rows: Positions, role: str, suspicions: Suspicions) -> Posi
             if is_alone and rows.is_geodetic[0] and (first, second) in _FILL_INS:
                 is_fill_in |= is_value & of_agent
             elif not is_alone and _jumps(rows[of_agent], is_value[of_agent]):
+                is_fill_in |= is_value & of_agent
+            elif (
+                (first, second) in _FILL_INS
+                and rows.agents.number[of_agent][0] < 0
+                and _flickers(rows[of_agent], is_value[of_agent])
+            ):
                 is_fill_in |= is_value & of_agent
     if not is_fill_in.any():
         return rows
@@ -90,6 +100,23 @@ def _by_agent(rows: Positions, is_value: Bools) -> Iterator[Bools]:
     """The rows [N] of each agent that has some of a value."""
     for number in np.unique(rows.agents.number[is_value]):
         yield rows.agents.number == number
+
+
+def _flickers(rows: Positions, is_value: Bools) -> bool:
+    """Whether rows without a name are at one place now and then, and no others of theirs come near it."""
+    messages, message = np.unique(rows.message, return_inverse=True)
+    is_there = np.zeros(len(messages), np.bool_)
+    is_there[message[is_value]] = True
+    times = int((np.diff(is_there.astype(np.int8), prepend=0) == 1).sum())
+    if times < _MIN_TIMES or is_there.mean() > _MAX_SHARE or is_value.all():
+        return False
+    unit_m = DEGREE_M if rows.is_geodetic[0] else 1.0
+    place, others = (np.column_stack([rows.first, rows.second])[mask] for mask in (is_value, ~is_value))
+    others = others[np.isfinite(others).all(axis=1)]
+    if not len(others):
+        return False
+    least_m = unit_m * float(np.hypot(*(others - place[0]).T).min())
+    return least_m > max(_MIN_APART_M, _FAR * unit_m * float(np.hypot(*np.ptp(others, axis=0))))
 
 
 def _jumps(rows: Positions, is_value: Bools) -> bool:

@@ -3,6 +3,7 @@
 A small number that a tracker gives out anew, sensors that count for themselves, a kind in place of a name.
 """
 
+import re
 from collections import defaultdict
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -20,8 +21,8 @@ from pipeline.suspicions import Suspicions, listed
 _MAX_ODD: Final = 0.3
 """Of the steps of a name: noise alone makes a target seem to leave and come back in one step of twelve."""
 _MIN_ROWS: Final = 4
-_MAX_DIGITS: Final = 5
-"""Of a number that a tracker counts; those of ships and aircraft have more."""
+_COUNTED: Final = re.compile(r"(?:(?:track|trk|object|obj|id|target)[^a-z0-9]*)?[0-9]{1,5}")
+"""Numbers that a tracker counts; those of ships and aircraft have more digits."""
 _SETTING: Final = "has_identity (true: names are believed, false: none is) in its [[extract.detections]]"
 
 
@@ -103,8 +104,7 @@ def _renamed(
     if odd > _MAX_ODD * len(rows):
         told.odd[name] = len(rows)
         return np.full(len(rows), None, dtype=object)
-    is_counted = name.rpartition("/")[2].isdecimal() and len(name.rpartition("/")[2]) <= _MAX_DIGITS
-    piece, jump = pieces_of(track[rows], tolerance_s, is_counted)
+    piece, jump = pieces_of(track[rows], tolerance_s, _COUNTED.fullmatch(name.rpartition("/")[2].lower()) is not None)
     if jump is None:
         return None
     told.jumps[name] = jump

@@ -1,11 +1,13 @@
 """Zeros and the like where no position is known, and real ones that only look like them."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 from fixtures.small_logs import Row, detection, fix
 from test_extract import fails, run
+from test_identity import array
 
 from cadence.errors import InputError
 
@@ -40,6 +42,26 @@ def test_metres_that_look_written(tmp_path: Path, place: tuple[float, float]) ->
     ways = [place if 20 <= i < 30 else (1500.0 + 5.0 * i, 2500.0) for i in range(60)]
     found = run(tmp_path, [detection(float(i), *way, agent_id="a") for i, way in enumerate(ways)])
     assert found.summary["num_detections"] == 50 and len(found.summary["suspicions"]) == 1
+
+
+@pytest.mark.parametrize(
+    ("is_zero", "others", "num"),
+    [
+        (lambda i: i % 10 == 3, (500.0, 400.0), 0),
+        (lambda i: i < 12, (500.0, 400.0), 12),  # one that stood there
+        (lambda i: i % 10 == 3, (-90.0, 0.0), 6),  # others pass there
+    ],
+)
+def test_zeros_in_lists_without_names(
+    tmp_path: Path, is_zero: Callable[[int], bool], others: tuple[float, float], num: int
+) -> None:
+    rows = [
+        array("/detections", i, [(others[0] + 3.0 * i, others[1]), (900.0 - 2.0 * i, 800.0), *([(0.0, 0.0)] * is_zero(i))])
+        for i in range(60)
+    ]
+    found = run(tmp_path, rows)
+    assert found.detections["x_m"].to_pylist().count(0.0) - (others == (-90.0, 0.0)) == num
+    assert len(found.summary["suspicions"]) == (num == 0)
 
 
 @pytest.mark.parametrize("held", [5, 30])

@@ -84,7 +84,9 @@ def test_a_number_that_is_given_out_again_is_another_target(tmp_path: Path) -> N
     assert kinds(run(tmp_path, rows, detections=[stated | {"has_identity": False}])) == []
 
 
-@pytest.mark.parametrize(("name", "far_m", "num"), [("3", 40.0, 2), ("ann", 40.0, 1), ("3", 15.0, 1), ("211123456", 40.0, 1)])
+@pytest.mark.parametrize(
+    ("name", "far_m", "num"), [("3", 40.0, 2), ("track_3", 40.0, 2), ("ann", 40.0, 1), ("3", 15.0, 1), ("211123456", 40.0, 1)]
+)
 def test_a_number_that_a_tracker_gives_to_another_walker(tmp_path: Path, name: str, far_m: float, num: int) -> None:
     """Receivers find their fix again as far away, and their names are no small numbers."""
     rows = [array("/people", i, [(1.0 * i, 0.0)], [name]) for i in range(30)]
