@@ -38,9 +38,10 @@ class FieldReader:
             self.is_found = True
             if self._convert is not None:
                 stated, values = values, {place: self._convert(value) for place, value in values.items()}
-                self.num_lost += sum(
-                    values[place] is None and isinstance(text, str) and text.strip() != "" for place, text in stated.items()
-                )
+                if None in values.values():
+                    self.num_lost += sum(
+                        values[place] is None and isinstance(text, str) and text.strip() != "" for place, text in stated.items()
+                    )
                 if values and all(value is None for value in values.values()):
                     unfilled = unfilled or values
                     continue

@@ -39,6 +39,8 @@ def in_one_reading(rows: Positions, role: str, suspicions: Suspicions) -> Positi
 
     Only where one target would have to leap between the two.
     """
+    if np.ptp(rows.first) < _FAR_DEG and np.ptp(rows.second) < _FAR_DEG:  # as of nearly every source
+        return rows
     places = np.column_stack([rows.first, rows.second])
     is_told = np.isfinite(places).all(axis=1) & (places != 0).any(axis=1)
     told = np.flatnonzero(is_told)
