@@ -215,7 +215,7 @@ def _is_smooth(rows: Positions, way_m: float) -> bool:
     """Whether the rows, by time, are a way whose scatter is far smaller than it."""
     order = np.argsort(rows.time_ns, kind="stable")
     bend_m = np.hypot(np.diff(rows.first[order], 2), np.diff(rows.second[order], 2))
-    return bool(np.median(bend_m) * _MIN_WAY_RATIO < way_m)
+    return len(bend_m) > 0 and bool(np.median(bend_m) * _MIN_WAY_RATIO < way_m)
 
 
 def _is_straight(rows: Positions, way_m: float) -> bool:
