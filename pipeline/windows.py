@@ -4,7 +4,7 @@ Inside a window time is seconds relative to its origin and space metres relative
 float64 mission coordinates end here.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -39,6 +39,26 @@ class MissionWindows:
         datum_m, names = torch.from_numpy(self.datum_m), self.agent_ids
         context = Context(datum_m, elapsed_s, obstacles=obstacles, evidence=evidence, agent_ids=names)
         return replace(self, batch=self.batch.with_context(context))
+
+
+    def with_unseen(self, agents: Sequence[str], near_m: Float64s) -> "MissionWindows":
+        """The same windows with agents that have no detection; windows without any lie about `near_m` [2]."""
+        if not agents:
+            return self
+        datum_m = np.where(self.batch.is_active.any(1).numpy()[:, None], self.datum_m, near_m)
+        batch = replace(self.batch, detections=_with_unseen(self.batch.detections, len(agents)))
+        return replace(self, batch=batch, agent_ids=(*self.agent_ids, *agents), datum_m=datum_m)
+
+
+def _with_unseen(found: Detections, num_agents: int) -> Detections:
+    """The same with so many agents behind the others that were never detected."""
+    columns = {
+        name: torch.cat([value, value.new_zeros(value.shape[0], num_agents, *value.shape[2:])], 1)
+        for name, value in vars(found).items()
+        if value is not None
+    }
+    columns["covariance_m2"][:, found.time_s.shape[1] :] = torch.eye(2, dtype=found.covariance_m2.dtype)
+    return Detections(**columns)
 
 
 def build_windows(detections: pa.Table, grid: Grid, seed: int, default_sigma_m: float = 0.0) -> MissionWindows:

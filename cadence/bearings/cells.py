@@ -18,6 +18,9 @@ from cadence.bearings.linear import Sights, pseudo_positions
 from cadence.bearings.profiles import Profiles
 
 _MOST_ROWS = 2048
+_NUM_COARSE = 8
+_LEAST_COARSE_SIZE = 15.0
+"""Cells so much smaller than the largest, as logarithms, are left out by what a few of the sights say."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,12 +103,33 @@ class Problem:
 
 
 def first_cells(problem: Problem, begin_s: Tensor) -> Cells:
-    """Every model about every supposed track, with sizes; `begin_s` [1] is when the window begins."""
-    profiles = problem.profiles
-    num_models, num_profiles = len(problem.prior.log_weight), len(profiles.supposed_m)
-    kernel_m, kernel_m2 = _kernels(problem, profiles.supposed_m, torch.arange(num_profiles))
+    """Every model about every supposed track that may count, with sizes; `begin_s` [1] is when the window begins.
+
+    A few of the sights tell which those are: the full sizes of the others are not worth their cost.
+    """
+    num_models, num_profiles = len(problem.prior.log_weight), len(problem.profiles.supposed_m)
     model = torch.arange(num_models).repeat_interleave(num_profiles)
     profile = torch.arange(num_profiles).repeat(num_models)
+    coarse = _thinned(problem)
+    if len(coarse.sights) < len(problem.sights):
+        size = _sized(coarse, model, profile, begin_s).log_size
+        may_count = size > size.max() - _LEAST_COARSE_SIZE
+        model, profile = model[may_count], profile[may_count]
+    return _sized(problem, model, profile, begin_s)
+
+
+def _thinned(problem: Problem) -> Problem:
+    """The same with no more than `_NUM_COARSE` of the sights, the first and the last among them."""
+    num, profiles = len(problem.sights), problem.profiles
+    rows = torch.linspace(0, num - 1, min(num, _NUM_COARSE), dtype=torch.float64).round().long()
+    anchor_row = torch.searchsorted(rows, profiles.anchor_row)
+    profiles = dataclasses.replace(profiles, supposed_m=profiles.supposed_m[:, rows], anchor_row=anchor_row)
+    return dataclasses.replace(problem, sights=problem.sights[rows], profiles=profiles)
+
+
+def _sized(problem: Problem, model: Tensor, profile: Tensor, begin_s: Tensor) -> Cells:
+    """Cells of models [L] about supposed tracks [L], with sizes."""
+    kernel_m, kernel_m2 = _kernels(problem, problem.profiles.supposed_m, torch.arange(len(problem.profiles.supposed_m)))
     sizes = []
     for some in torch.split(torch.arange(len(model)), _MOST_ROWS):
         at = profile[some]

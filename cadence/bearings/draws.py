@@ -134,7 +134,7 @@ def _few_models(cells: Cells, prior: Prior, uniform: float) -> tuple[Cells, Prio
     To leave out the smallest cells of all models instead would take away from the far ends of what bearings allow (measured).
     """
     num_models = len(prior.log_weight)
-    size = torch.full((num_models, len(cells) // num_models), -torch.inf, dtype=torch.float64)
+    size = torch.full((num_models, int(cells.profile.max()) + 1), -torch.inf, dtype=torch.float64)
     size[cells.model, cells.profile] = cells.log_size
     chance = torch.softmax(_TOLD * size.logsumexp(1), 0)
     chosen, weight = resample(chance.numpy(), _MOST_MODELS, uniform)

@@ -10,6 +10,7 @@ from cadence.constraints.smoothing import smoothed
 from cadence.constraints.speed import exceeds
 
 _ROUNDING = 1.0 + 1e-6
+_LEAST_SHARE = 0.05
 _NUM_LEVELS = 24
 """Each level smooths a track over about a fifth more steps than the one before."""
 
@@ -28,6 +29,15 @@ class Agility:
     max_turn_rad: float | None = None
     least_m: float = 0.0
     longest_m: float | Tensor | None = None
+
+    @classmethod
+    def stated(
+        cls, acceleration_mps2: float | None, turn_rate_dps: float | None, longest_m: float | None, step_s: float, length_m: float
+    ) -> "Agility":
+        """Limits as people state them, on steps of `step_s`; one of under a twentieth of `length_m` has no direction."""
+        bend_m = None if acceleration_mps2 is None else acceleration_mps2 * step_s**2
+        turn_rad = None if turn_rate_dps is None else math.radians(turn_rate_dps) * step_s
+        return cls(bend_m, turn_rad, _LEAST_SHARE * length_m, longest_m)
 
     @property
     def is_limited(self) -> bool:

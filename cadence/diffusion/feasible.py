@@ -1,6 +1,5 @@
 """Constraints on hypotheses: guidance of clean estimates while sampling, repair and weights at the end."""
 
-import math
 from dataclasses import dataclass, replace
 from typing import Self
 
@@ -114,9 +113,8 @@ class Feasibility:
         return moved, weight / weight.sum(1, keepdim=True), is_feasible
 
     def _agility(self, length_m: float) -> Agility:
-        bend_m = None if self.max_acceleration_mps2 is None else self.max_acceleration_mps2 * self.step_s**2
-        turn_rad = None if self.max_turn_rate_dps is None else math.radians(self.max_turn_rate_dps) * self.step_s
-        return Agility(bend_m, turn_rad, _PINNED_SHARE * length_m, self.longest_m)
+        limits = self.max_acceleration_mps2, self.max_turn_rate_dps, self.longest_m
+        return Agility.stated(*limits, self.step_s, length_m)
 
     def _within_limits(self, position_m: Tensor, sigma_m: Tensor, length_m: float, agility: Agility) -> tuple[Tensor, Tensor]:
         is_pinned = (sigma_m <= _PINNED_SHARE * length_m)[:, None].expand(position_m.shape[:3])

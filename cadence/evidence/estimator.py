@@ -21,7 +21,8 @@ from cadence.types import Detections, Estimator, HypothesisSet, WindowBatch
 CONTRADICTED, FEW_FIT = "contradicted", "few_fit"
 """Statuses: evidence that speaks against every track was set aside; hardly any track fits what the evidence says."""
 
-_FEWEST = 0.1
+FEWEST = 0.1
+"""Of the hypotheses that count; below it the status says so."""
 _MOST_NUMBERS = 8_000_000
 """Coordinates drawn at once where more hypotheses are drawn: 64 MB."""
 
@@ -182,7 +183,7 @@ def _put(whole: HypothesisSet, rows: Tensor, part: HypothesisSet) -> HypothesisS
 def _with_few(found: HypothesisSet, num_hypotheses: int) -> HypothesisSet:
     """The same; where hardly any hypothesis counts the status says so."""
     assert found.num_effective is not None
-    is_few = found.num_effective < _FEWEST * num_hypotheses  # false where nothing speaks
+    is_few = found.num_effective < FEWEST * num_hypotheses  # false where nothing speaks
     status = tuple(
         tuple(FEW_FIT if few and word == "ok" else word for few, word in zip(row, words, strict=True))
         for row, words in zip(is_few.tolist(), found.status, strict=True)

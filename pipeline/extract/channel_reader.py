@@ -159,6 +159,12 @@ class ChannelReader:
     def check(self) -> None:
         """`ConfigError` where something that the user stated was in no message."""
         alternatives = [(reader,) for reader in self.fields.values()] + list(zip(*self.positions, strict=True))
+        if self.is_polar and not self.is_camera:
+            either = [alternative for alternative in self.positions[0][:2] if alternative.paths]
+            if self.is_stated and self.counts["messages"] and not any(reader.is_found for reader in either):
+                where = f"extract.{self.role}, topic {self.channel.topic}"
+                lacks = " and ".join(reader.problem for reader in either)
+                raise ConfigError(f"{where}: no message has {lacks}; correct the [extract] entry")
         for readers in alternatives:
             if readers[0].is_needed and self.counts["messages"] and not any(reader.is_found for reader in readers):
                 where = f"extract.{self.role}, topic {self.channel.topic}"
@@ -265,7 +271,8 @@ MEASURED = (
     "range_rate", "range_sigma", "bearing_sigma", "elevation_sigma", "range_rate_sigma", "box_width", "box_height",
 )  # fmt: skip
 """What sources of ranges and bearings, or of pixels, may state beside these."""
-_NEEDED = ("x", "y", "latitude", "longitude", "range", "bearing", "pixel_x", "pixel_y")
+_NEEDED = ("x", "y", "latitude", "longitude", "pixel_x", "pixel_y")
+"""Of a type, every one; of range and bearing one is enough: a direction finder has no ranges."""
 _OTHERS = ("covariance", "covariance_type", "sigma", "time", "frame_id", "agent", "sensor", "score")
 _CONVERSIONS: Mapping[str, Callable[[Any], Any]] = {"time": stamp_ns, "frame_id": _frame_name}
 

@@ -15,7 +15,7 @@ from cadence.evidence.estimator import WithEvidence
 from cadence.evidence.measurements import Measurements
 from cadence.evidence.silence import Looks
 from cadence.height.bank import HeightBeside
-from cadence.types import Evidence
+from cadence.types import Estimator, Evidence
 from pipeline.associations import AssociatedWindows, Sources, build_associated_windows, tell_sources
 from pipeline.checkpoints import DEFAULT
 from pipeline.estimators.fit_test import FitTest, fit_test
@@ -24,7 +24,7 @@ from pipeline.estimators.loaded import Fitted, Loaded
 from pipeline.estimators.presets import load_estimator
 from pipeline.infer.config import InferConfig
 from pipeline.infer.draws import Piece, draw_associations, draw_tracks, draw_windows
-from pipeline.infer.measuring import hear_measurements
+from pipeline.infer.measuring import drawn_by_measurements, hear_measurements, with_unseen
 from pipeline.infer.silence import hear_silence
 from pipeline.looks import Footprint
 from pipeline.progress import Progress
@@ -120,6 +120,8 @@ class Plan:
             about["fit_test"] = None if test is None else asdict(test)
         fitted = _with_heights(loaded.fitted(data), data)
         knows, start_ns = loaded.knows_standing, beside.start_ns
+        if seen.associated is None:
+            seen = replace(seen, named=with_unseen(seen.named, beside.measurements, config.evidence))
         given = beside.looks, beside.obstacles, config.evidence, fitted.estimator
         silence = hear_silence(*given, seen.named, start_ns, knows)
         names = seen.named.agent_ids if seen.associated is None else seen.associated.windows.agent_ids
@@ -127,7 +129,10 @@ class Plan:
         heard = (*beside.evidence, *silence.evidence, *measured.evidence)
         num, evidence = config.num_hypotheses, heard if config.evidence.is_used else ()
         if seen.associated is None:
-            weighed = WithEvidence(fitted.estimator, config.evidence, loaded.is_apart, loaded.num_past)
+            weighed: Estimator = WithEvidence(fitted.estimator, config.evidence, loaded.is_apart, loaded.num_past)
+            if measured.evidence:
+                bank = data.fitted_bank().members[0]
+                weighed = drawn_by_measurements(weighed, bank, config.evidence, config.guidance, seen.sources.grid.step_s)
             located = seen.named.located(beside.start_ns, beside.obstacles, evidence)
             draws = draw_windows(weighed, located, num, loaded.is_apart)
         else:

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from cadence import metrics
 from cadence.arrays import Float32s
+from cadence.bearings.estimator import MEASURED
 from cadence.constraints.speed import needed_speed
 from cadence.evidence.estimator import CONTRADICTED, FEW_FIT
 from cadence.types import Detections, HypothesisSet
@@ -22,6 +23,7 @@ ADVICE = {
     "scarce": "hardly a draw keeps all limits, so these are narrower than what is known; check obstacles and infer.guidance",
     CONTRADICTED: "what else is known (silence of sensors, bearings, ...) speaks against every track and was left out here; "
     "check the sensors' footprints and clocks, how their bearings count, or whether the target is another one",
+    MEASURED: "no position is known within this window's history: these tracks rest on bearings or ranges alone",
     FEW_FIT: "hardly any track fits what else is known, so these few may miss the target; a larger infer.evidence.most_draws "
     "or infer.num_hypotheses draws more",
     "guidance_diverged": "sampling did not stay finite, so the bank's samples stand in; report this log",
@@ -30,10 +32,10 @@ ADVICE = {
 
 
 def hypothesis_rows(log_id: str, windows: MissionWindows, grid: Grid, part: Tensor, drawn: HypothesisSet) -> pa.Table:
-    """HYPOTHESES rows of the active agents, by window, hypothesis, agent."""
+    """HYPOTHESES rows of the active agents, and of those drawn without a position, by window, hypothesis, agent."""
     position, weight = drawn.position_m, drawn.weight
-    active = windows.batch.is_active[part]
     b, k, a, t = position.shape[:4]
+    active = windows.batch.is_active[part] | position.isfinite().any(-1).any(-1).any(1)
     is_row = active[:, None, :].expand(b, k, a)
     window, hypothesis, agent = (index.numpy() for index in is_row.nonzero(as_tuple=True))
     which = part.numpy()[window]
@@ -89,7 +91,7 @@ def window_rows(windows: MissionWindows, part: Tensor, drawn: HypothesisSet, max
                     "advice": _advice(status[index][a], detections[index : index + 1], a, max_speed_mps),
                     "num_detections": int(detections.count[index, a]),
                     "age_s": float(age[index, a]) if is_active else None,
-                    "spread_m": float(spread[index, a]) if is_active else None,
+                    "spread_m": float(spread[index, a]) if is_active or status[index][a] == MEASURED else None,
                 }
             )
     return pa.Table.from_pylist(rows, schema=WINDOWS)

@@ -121,6 +121,20 @@ def test_a_window_holds_its_history_and_nothing_after_the_origin() -> None:
         assert bool((after.time_s[index][after.is_observed[index]] > 0).all())
 
 
+def test_agents_without_detections_join_behind_and_windows_of_them_alone_lie_near_whom_is_told() -> None:
+    found = table([0.0, 4.0], position_m=np.array([[1000.0, 500.0], [1010.0, 500.0]]))
+    windows = build_windows(found, plan_grid(table([0.0, 20.0, 40.0, 60.0]), CONFIG), 0)
+    assert windows.with_unseen((), np.zeros(2)) is windows
+    more = windows.with_unseen(("owl", "bat"), np.array([900.0, 400.0]))
+    assert more.agent_ids == ("fox", "owl", "bat")
+    assert not more.batch.is_active[:, 1:].any() and torch.equal(more.batch.is_active[:, :1], windows.batch.is_active)
+    is_empty = ~windows.batch.is_active[:, 0].numpy()
+    assert is_empty.any() and (more.datum_m[is_empty] == [900.0, 400.0]).all()
+    assert (more.datum_m[~is_empty] == windows.datum_m[~is_empty]).all()
+    assert torch.equal(more.batch.detections.position_m[:, :1], windows.batch.detections.position_m)
+    assert (torch.linalg.det(more.batch.detections.covariance_m2[:, 1:]) == 1).all()
+
+
 def test_first_and_last_of_a_step_are_kept() -> None:
     found = table([0.0, 0.2, 0.4, 0.9, 1.5, 2.0, 2.1])
     windows = build_windows(found, plan_grid(found, CONFIG), 0)

@@ -9,6 +9,8 @@ import torch
 from cadence.bank.bank import Bank
 from cadence.bank.components import constant_velocity
 from cadence.bearings.estimator import MEASURED, WithBearings, steady
+from cadence.constraints.agility import Agility
+from cadence.constraints.obstacles import Obstacles
 from cadence.evidence.estimator import FEW_FIT, WithEvidence
 from cadence.evidence.footprints import DetectionCurve
 from cadence.evidence.measurements import Measurements
@@ -108,3 +110,20 @@ def test_steady_models_only():
     assert torch.equal(models.diffusion, bank.models.diffusion[torch.from_numpy(which)])
     assert float(log_weight.exp().sum()) == pytest.approx(1.0)
     assert WithBearings(BANK, BANK).name == "bank"
+
+
+def test_limits_leave_only_tracks_that_keep_them():
+    """T1 goes north at 3 m/s: some of its tracks keep 3.5 m/s and a distance from a rock beside the way, none half a metre."""
+    batch = windows(crossed("T1"))
+    there = torch.tensor([[DATUM_M[0] + 830.0, DATUM_M[1] + 600.0, 20.0]], dtype=torch.float64)
+    batch = dataclasses.replace(batch, context=dataclasses.replace(batch.context, obstacles=Obstacles(there)))
+    bearings = WithBearings(WithEvidence(BANK), BANK, 3000.0, limits=Agility(longest_m=3.5 * STEP_S), margin_m=5.0)
+    found = bearings.sample(batch, 40)
+    track_m = found.position_m[0, :, 1]
+    assert found.status[0][1] == MEASURED and track_m.isfinite().all()
+    assert float(track_m.diff(dim=1).norm(dim=-1).max()) <= 3.5 * STEP_S * (1 + 1e-6)
+    assert float((track_m - torch.tensor([830.0, 600.0])).norm(dim=-1).min()) >= 25.0
+    free_m = drawn(batch).position_m[0, :, 1]
+    assert float((free_m - torch.tensor([830.0, 600.0])).norm(dim=-1).min()) < 25.0
+    slow = dataclasses.replace(bearings, limits=Agility(longest_m=0.5 * STEP_S)).sample(batch, 40)
+    assert slow.status[0][1] == FEW_FIT and slow.position_m[0, :, 1].isnan().all()

@@ -6,11 +6,13 @@ from pathlib import Path
 import numpy as np
 from test_infer import CONFIG, FRAME, START_NS, mission, run
 
+from cadence.bearings.estimator import MEASURED
 from cadence.evidence.settings import WeighingConfig
 from pipeline.infer.measuring import hear_measurements
 from pipeline.manifest import read_manifest
 from pipeline.measurements import MeasurementRows, read_measurements, write_measurements
 from pipeline.results import read_hypothesis_tables
+from pipeline.tables import read_table
 
 NUM = 60
 MAST = np.array([-500.0, 0.0])
@@ -82,12 +84,24 @@ def test_bearings_that_are_set_aside_in_most_windows_are_told(tmp_path: Path) ->
     assert "how their bearings count" in summary["remarks"][-1]
 
 
-def test_whom_nobody_can_draw_is_said(tmp_path: Path) -> None:
-    summary = inferred(with_bearings(mission(tmp_path), ("T0", "owl", "owl", None)))
-    assert summary["measurements"] == {"num_used": 1, "num_not_used": 3, "agents": {"T0": 1}}
-    first, second = summary["remarks"][-2:]
-    assert first == '2 measurements are about "owl", of whom no position is known: nobody can draw them yet'
-    assert second.startswith("1 measurement says not which of 2 agents they are about and are not used")
+def test_who_was_never_seen_is_drawn_from_bearings(tmp_path: Path) -> None:
+    """An owl is heard in four moments from the mast, which cannot tell how far away it is; one more bearing is nobody's."""
+    heard = with_bearings(mission(tmp_path), ("T0", *["owl"] * 4, None), at_s=np.array([106.0, 90, 100, 110, 120, 120]))
+    summary = inferred(heard)
+    assert summary["measurements"] == {"num_used": 5, "num_not_used": 1, "agents": {"T0": 1, "owl": 4}}
+    assert summary["remarks"][-1].startswith("1 measurement says not which of 3 agents they are about and are not used")
+    tables = read_hypothesis_tables(heard)
+    first = next(window for window in tables.windows if window.origin_ns >= START_NS + 120 * 10**9)
+    owl = next(agent for agent in first.agents if agent.agent_id == "owl")
+    assert owl.status == MEASURED
+    away = owl.position_m[:, 15] + np.array(owl.datum_m) - MAST
+    range_m, bearing = np.hypot(*away.T), np.arctan2(away[:, 1], away[:, 0])
+    assert np.abs(bearing - np.arctan2(*(MIDDLE - MAST)[::-1])).max() < 0.5
+    assert np.quantile(range_m, 0.95) > 4.0 * np.quantile(range_m, 0.05)
+    rows, _ = read_table(heard / "windows.parquet", "windows")
+    mine = [row for row in rows.to_pylist() if row["agent_id"] == "owl"]
+    assert {row["status"] for row in mine} == {"no_detections", MEASURED}
+    assert all(row["num_detections"] == 0 and row["age_s"] is None for row in mine)
 
 
 def test_switched_off_no_byte_differs(tmp_path: Path) -> None:
