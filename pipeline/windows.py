@@ -40,7 +40,6 @@ class MissionWindows:
         context = Context(datum_m, elapsed_s, obstacles=obstacles, evidence=evidence, agent_ids=names)
         return replace(self, batch=self.batch.with_context(context))
 
-
     def with_unseen(self, agents: Sequence[str], near_m: Float64s) -> "MissionWindows":
         """The same windows with agents that have no detection; windows without any lie about `near_m` [2]."""
         if not agents:

@@ -3,9 +3,9 @@
 Drawing and weighing ends where measurements are sharp: no draw of a prior fits thirty bearings. There, and where an agent has
 no position at all, joint samples come from the bank's steady models, given positions and measurements together.
 
-Calibrated as far as this goes: of 50 targets drawn from the sampler's own prior (20 steady models, one observer with one turn, 30
-bearings of 1.5 degrees, no position) 3 were refused, and the 90 % region held 89, 87 and 93 % of the other 47 at the first,
-middle and last bearing (standard error 4). Those refused are not chance ones, but far and fast.
+Calibrated as far as this goes: of 50 targets drawn from the sampler's own prior (20 steady models, one observer with one turn,
+30 bearings of 1.5 degrees, no position) 3 were refused, and the 90 % region held 89, 87 and 93 % of the other 47 at the
+first, middle and last bearing (standard error 4). Those refused are not chance ones, but far and fast.
 """
 
 import dataclasses

@@ -32,7 +32,12 @@ class Agility:
 
     @classmethod
     def stated(
-        cls, acceleration_mps2: float | None, turn_rate_dps: float | None, longest_m: float | None, step_s: float, length_m: float
+        cls,
+        acceleration_mps2: float | None,
+        turn_rate_dps: float | None,
+        longest_m: float | None,
+        step_s: float,
+        length_m: float,
     ) -> "Agility":
         """Limits as people state them, on steps of `step_s`; one of under a twentieth of `length_m` has no direction."""
         bend_m = None if acceleration_mps2 is None else acceleration_mps2 * step_s**2
