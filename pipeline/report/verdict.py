@@ -13,6 +13,7 @@ from pipeline.report.mission import Mission
 from pipeline.report.scored import PARTS, Scored
 from pipeline.score_words import coverage_words
 
+_STATUS_WORDS = {"measured": "no position is known, so that the tracks rest on bearings or ranges alone"}
 _SURE = 0.9
 """An agent that is less likely than this may be none."""
 
@@ -82,7 +83,8 @@ def _doubts(mission: Mission, analysis: Analysis, num_parted: tuple[int, int]) -
     if not mission.catalogue.health.is_complete:
         yield "The log is damaged: messages are lost, or may be."
     for status, count in Counter(row.status for row in mission.rows if row.status != "ok").most_common():
-        yield f"{count:,} of {len(mission.rows):,} pairs of a window and an agent: {status.replace('_', ' ')}."
+        words = _STATUS_WORDS.get(status, status.replace("_", " "))
+        yield f"{count:,} of {len(mission.rows):,} pairs of a window and an agent: {words}."
     yield from _doubts_of_truth(analysis.scored, analysis.speeds)
     yield from _doubts_of_identity(mission)
     parted, shown = num_parted
