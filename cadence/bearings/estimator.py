@@ -43,7 +43,7 @@ _MOST_FORGOTTEN = 0.1
 """Per step: tracks that forget their velocity faster may be at too many ranges on every bearing."""
 _LEAST_WEIGHT, _MOST_MODELS = 0.01, 24
 _MOST_MEASUREMENTS = 400
-_LEAST_SHARE = 0.02
+LEAST_SHARE = 0.02
 """Of the samples that must count. Of the few targets below it the 90 % region held none (measured)."""
 _NEAREST, _FARTHEST = 0.005, 3.0
 _ENOUGH = 0.5
@@ -161,7 +161,7 @@ class WithBearings:
             said = hear(rest, whole).apart[0, :, agent].numpy()
             weight = weight * np.exp(said - said.max())
         weight = np.where(self._are_kept(track_m, window), weight, 0.0)
-        if cloud.num_effective < _LEAST_SHARE * self.num_drawn or not weight.any():
+        if cloud.num_effective < LEAST_SHARE * self.num_drawn or not weight.any():
             return None
         num_effective = min(cloud.num_effective, effective_number(weight))
         index = generator.permutation(systematic(weight, num, float(generator.random())))
