@@ -22,7 +22,7 @@ from torch import Tensor
 from cadence.bank.smoother import Backward, Nodes, backward_kernel, draw
 from cadence.bearings.cells import Cells, Prior, Problem, first_cells, refined
 from cadence.bearings.linear import Sights, turned
-from cadence.bearings.profiles import supposed_tracks
+from cadence.bearings.profiles import Profiles, supposed_tracks
 from cadence.resampling import effective_number, resample, systematic
 
 _MOST_MODELS = 8
@@ -50,6 +50,7 @@ class Known:
     sights      bearings and ranges, one or more
     nearest_m, farthest_m  ranges that are supposed where none is measured
     begin_s     [1] when the window begins: the prior's place is that of the first node from here on
+    supposed_m  [P, M, 2] tracks at the sights that positions make likely; without any, tracks are supposed at several ranges
     likelihood  exact log likelihood [D] of states [D, M, S] at the times that are asked for
     """
 
@@ -60,6 +61,7 @@ class Known:
     farthest_m: float
     begin_s: Tensor
     likelihood: Callable[[Tensor], Tensor]
+    supposed_m: Tensor | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +93,7 @@ def posterior(known: Known, time_s: Tensor, num: int, generator: np.random.Gener
             break
         is_fitting = ~is_outlying if float(is_outlying.double().mean()) <= _MOST_OUTLIERS else is_used
         if torch.equal(is_fitting, is_used):
-            if ratio == _FINE:
+            if ratio == _FINE or known.supposed_m is not None:
                 break
             ratio = _FINE
         is_used = is_fitting
@@ -104,7 +106,10 @@ def _sampled(
 ) -> tuple[Cloud, Tensor]:
     """Samples from cells about some of the sights, and which of all sights [M] they miss."""
     sights = known.sights[is_used]
-    profiles = supposed_tracks(sights, known.nearest_m, known.farthest_m, ratio)
+    if known.supposed_m is None:
+        profiles = supposed_tracks(sights, known.nearest_m, known.farthest_m, ratio)
+    else:
+        profiles = Profiles.about(known.supposed_m[:, is_used])
     problem = Problem(known.prior, known.detections, sights, profiles)
     cells, prior = _few_models(first_cells(problem, known.begin_s), known.prior, float(generator.random()))
     problem, cells = dataclasses.replace(problem, prior=prior), _largest(cells)

@@ -43,6 +43,8 @@ _MOST_FORGOTTEN = 0.1
 """Per step: tracks that forget their velocity faster may be at too many ranges on every bearing."""
 _LEAST_WEIGHT, _MOST_MODELS = 0.01, 24
 _MOST_MEASUREMENTS = 400
+_MOST_SUPPOSED = 12
+"""Tracks of the estimator about which measurements are made linear where positions are known."""
 LEAST_SHARE = 0.02
 """Of the samples that must count. Of the few targets below it the 90 % region held none (measured)."""
 _NEAREST, _FARTHEST = 0.005, 3.0
@@ -125,7 +127,10 @@ class WithBearings:
         """The same with the agents of one window drawn by the bank; the others are weighed without what is told of these."""
         num = found.position_m.shape[1]
         part = windows[row : row + 1]
-        drawn = {agent: self._drawn(part, agent, measurements, num) for agent, measurements in told.items()}
+        drawn = {
+            agent: self._drawn(part, agent, measurements, num, found.position_m[row, :, agent].double())
+            for agent, measurements in told.items()
+        }
         done = {agent: one for agent, one in drawn.items() if one is not None}
         position_m, weight = found.position_m.clone(), found.weight.clone()
         height_m = None if found.height_m is None else found.height_m.clone()
@@ -149,10 +154,15 @@ class WithBearings:
             height_m=height_m,
         )  # fmt: skip
 
-    def _drawn(self, window: WindowBatch, agent: int, measurements: Measurements, num: int) -> tuple[Tensor, float] | None:
-        """Tracks [K, T, 2] of one agent, all of the same weight, and how many count; None where too few do."""
+    def _drawn(
+        self, window: WindowBatch, agent: int, measurements: Measurements, num: int, known_m: Tensor
+    ) -> tuple[Tensor, float] | None:
+        """Tracks [K, T, 2] of one agent, all of the same weight, and how many count; None where too few do.
+
+        `known_m` [K, T, 2] are those that positions alone make likely; NaN without any.
+        """
         generator = numpy_stream(int(window.seeds[0]), "bearings", agent)
-        cloud, track_m = self._posterior(window, agent, measurements, generator)
+        cloud, track_m = self._posterior(window, agent, measurements, generator, known_m)
         weight = cloud.weight.numpy()
         rest = _without(window, (agent,))
         if rest.context is not None and rest.context.evidence:
@@ -181,7 +191,7 @@ class WithBearings:
         return are_kept.numpy()
 
     def _posterior(
-        self, window: WindowBatch, agent: int, measurements: Measurements, generator: np.random.Generator
+        self, window: WindowBatch, agent: int, measurements: Measurements, generator: np.random.Generator, known_m: Tensor
     ) -> tuple[Cloud, Tensor]:
         """Weighted samples, and their positions at the steps [D, T, 2]."""
         if len(measurements) > _MOST_MEASUREMENTS:
@@ -203,7 +213,8 @@ class WithBearings:
             at = state[:, first:-1].numpy()
             return torch.from_numpy(measurements.fits(at[..., :2], at[..., 2:4]).sum(axis=-1))
 
-        known = Known(prior, rows, sights, _NEAREST * prior.reach_m, farthest_m, time_s[:1], likelihood)
+        supposed_m = _at_times(known_m[:_MOST_SUPPOSED], time_s, sights.time_s) if bool(known_m.isfinite().all()) else None
+        known = Known(prior, rows, sights, _NEAREST * prior.reach_m, farthest_m, time_s[:1], likelihood, supposed_m)
         cloud = posterior(known, asked_s, self.num_drawn, generator)
         track_m = torch.empty(len(cloud.weight), len(time_s), 2, dtype=torch.float64)
         track_m[:, is_before] = cloud.state[:, :first, :2]
@@ -252,6 +263,13 @@ def steady(bank: Bank) -> tuple[MotionModels, np.ndarray, Tensor]:
     which = log_weight.argsort(descending=True, stable=True)[:_MOST_MODELS]
     which = which[log_weight[which].isfinite()].sort().values
     return models[which], which.numpy(), log_weight[which].log_softmax(0)
+
+
+def _at_times(track_m: Tensor, time_s: Tensor, asked_s: Tensor) -> Tensor:
+    """Tracks [K, T, 2] at other times [M], straight between two steps [K, M, 2]."""
+    right = torch.searchsorted(time_s, asked_s).clamp(1, len(time_s) - 1)
+    share = ((asked_s - time_s[right - 1]) / (time_s[right] - time_s[right - 1]))[:, None]
+    return track_m[:, right - 1] + share * (track_m[:, right] - track_m[:, right - 1])
 
 
 def _row_of(window: WindowBatch, agent: int) -> Nodes:

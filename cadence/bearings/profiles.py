@@ -33,6 +33,12 @@ class Profiles:
     anchor_m: Tensor
     anchor_m2: Tensor
 
+    @staticmethod
+    def about(supposed_m: Tensor) -> "Profiles":
+        """Tracks [P, M, 2] that positions hold where they are: no kernel is needed."""
+        nothing = supposed_m.new_zeros(len(supposed_m), 0, 2)
+        return Profiles(supposed_m, torch.zeros(0, dtype=torch.int64), nothing, nothing.new_zeros(len(supposed_m), 0, 2, 2))
+
 
 def supposed_tracks(sights: Sights, nearest_m: float, farthest_m: float, ratio: float) -> Profiles:
     """All supposed tracks from the first to the last sight.

@@ -1,5 +1,6 @@
 """Constraints on hypotheses: guidance of clean estimates while sampling, repair and weights at the end."""
 
+import math
 from dataclasses import dataclass, replace
 from typing import Self
 
