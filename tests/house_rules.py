@@ -1,6 +1,7 @@
 """What no source file may do: each rule takes a file's name and content and returns its offences."""
 
 import ast
+import functools
 from pathlib import Path
 
 MAY_IMPORT = {
@@ -48,9 +49,15 @@ RECURRENT_FILE = "cadence/network/recurrent.py"  # where they are kept in float3
 LONG_FUNCTIONS: dict[str, str] = {}  # path::function: the reason why it is one function
 
 
+@functools.cache
+def nodes_of(tree: ast.Module) -> tuple[ast.AST, ...]:
+    """All nodes of a module; most of what a rule costs is to walk over them."""
+    return tuple(ast.walk(tree))
+
+
 def imported_modules(tree: ast.Module) -> set[str]:
     found = set()
-    for node in ast.walk(tree):
+    for node in nodes_of(tree):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
@@ -77,7 +84,7 @@ def unwanted(name: str, tree: ast.Module) -> list[str]:
     """Names that say nothing, printing, evaluated text, exceptions swallowed, globals, recurrent layers outside their place."""
     found = [f"{name}: says nothing of what is in it"] if Path(name).stem in FORBIDDEN_NAMES else []
     aliases = aliases_in(tree)
-    for node in ast.walk(tree):
+    for node in nodes_of(tree):
         where = f"{name}, line {getattr(node, 'lineno', '?')}"
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
             found += [f"{where}: {node.func.id}"] if node.func.id in ("print", "eval", "exec", "input") else []
@@ -98,7 +105,7 @@ def unwanted(name: str, tree: ast.Module) -> list[str]:
 def aliases_in(tree: ast.Module) -> dict[str, str]:
     """What the names that a module imports stand for: np -> numpy, manual_seed -> torch.random.manual_seed."""
     found = {}
-    for node in ast.walk(tree):
+    for node in nodes_of(tree):
         if isinstance(node, ast.Import):
             found |= {alias.asname: alias.name for alias in node.names if alias.asname}
         elif isinstance(node, ast.ImportFrom):
@@ -119,10 +126,10 @@ def full_name(node: ast.expr, aliases: dict[str, str]) -> str:
 def global_randomness(name: str, tree: ast.Module) -> list[str]:
     """Draws from streams that all share, and seeds of theirs, unless torch's is put back afterwards (`fork_rng`)."""
     aliases, found = aliases_in(tree), []
-    with_blocks = [node for node in ast.walk(tree) if isinstance(node, ast.With)]
+    with_blocks = [node for node in nodes_of(tree) if isinstance(node, ast.With)]
     forks = [block for block in with_blocks if any("fork_rng(" in ast.unparse(item) for item in block.items)]
     is_put_back = {id(node) for block in forks for node in ast.walk(block)}
-    for node in ast.walk(tree):
+    for node in nodes_of(tree):
         if not isinstance(node, ast.Call):
             continue
         called = full_name(node.func, aliases)

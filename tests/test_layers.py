@@ -13,6 +13,7 @@ from house_rules import (
     MAX_FILE_LINES,
     MAX_FUNCTION_LINES,
     global_randomness,
+    nodes_of,
     too_long,
     unwanted,
     wrong_imports,
@@ -92,7 +93,7 @@ def imports_within(modules: dict[str, ast.Module]) -> dict[str, set[str]]:
     arrows: dict[str, set[str]] = {}
     for name, tree in modules.items():
         found = set()
-        for node in ast.walk(tree):
+        for node in nodes_of(tree):
             if isinstance(node, ast.Import):
                 found |= {alias.name for alias in node.names}
             elif isinstance(node, ast.ImportFrom) and node.module:
@@ -187,7 +188,7 @@ def test_exceptions_from_the_limits_are_needed():
     lengths = {
         f"{name_of(path)}::{node.name}": (node.end_lineno or 0) - node.lineno + 1
         for path in SOURCES
-        for node in ast.walk(tree_of(path))
+        for node in nodes_of(tree_of(path))
         if isinstance(node, ast.FunctionDef)
     }
     assert all(lengths.get(name, 0) > MAX_FUNCTION_LINES for name in LONG_FUNCTIONS)

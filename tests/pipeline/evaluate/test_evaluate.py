@@ -180,7 +180,7 @@ def test_collisions_are_those_of_the_stated_obstacles(tmp_path: Path) -> None:
 
 
 def test_truth_that_enters_an_obstacle_is_told(tmp_path: Path) -> None:
-    mission, config = build_mission(tmp_path), EvaluateConfig(rivals=())
+    mission, config = build_mission(tmp_path, num_hypotheses=3), EvaluateConfig(rivals=(), num_resamples=20)
 
     def line(radius_m: float, x_m: float = 1700.0) -> list[str]:
         circle = {"kind": "circle", "x_m": x_m, "y_m": -100.0, "radius_m": radius_m}
@@ -196,7 +196,7 @@ def test_truth_that_enters_an_obstacle_is_told(tmp_path: Path) -> None:
 
 
 def test_agents_without_hypotheses_are_counted(tmp_path: Path) -> None:
-    mission = build_mission(tmp_path)
+    mission = build_mission(tmp_path, num_hypotheses=3)
     scored = score_mission(mission, EvaluateConfig(rivals=()), QUIET)
     # T1 has detections in the last window but no hypotheses there.
     assert scored.num_unscored == 1
@@ -204,8 +204,9 @@ def test_agents_without_hypotheses_are_counted(tmp_path: Path) -> None:
     assert not ((own.agent == AGENT_IDS.index("T1")) & (own.window == NUM_WINDOWS - 1)).any()
 
 
-def test_scores_do_not_depend_on_where_the_frame_lies(mission: Path, tmp_path: Path) -> None:
-    moved = build_mission(tmp_path)
+def test_scores_do_not_depend_on_where_the_frame_lies(tmp_path: Path) -> None:
+    (tmp_path / "moved").mkdir()
+    mission, moved = (build_mission(parent, num_hypotheses=4) for parent in (tmp_path, tmp_path / "moved"))
 
     def shift(name: str, x: str, y: str, move: Callable[[str, np.ndarray], np.ndarray]) -> None:
         table, frame = read_table(moved / f"{name}.parquet", name)
@@ -227,7 +228,7 @@ def test_scores_do_not_depend_on_where_the_frame_lies(mission: Path, tmp_path: P
 
 
 def test_folder_pools_missions(tmp_path: Path) -> None:
-    first = build_mission(tmp_path)
+    first = build_mission(tmp_path, num_hypotheses=3)
     folder = tmp_path / "missions"
     for index in range(6):
         (folder / f"m{index}").parent.mkdir(exist_ok=True)
@@ -237,7 +238,9 @@ def test_folder_pools_missions(tmp_path: Path) -> None:
     assert result.summary["num_logs"] == 6 and scores["grouped_by"] == "log"
     row = next(r for r in scores["rows"] if r["metric"] == "ade_m" and r["part"] == "past" and r["by"] == "part")
     assert row["num_groups"] == 6 and row["low"] == pytest.approx(row["high"])  # six times the same log
-    delay_truth(build_mission(folder))
+    for index in range(1, 6):
+        (folder / f"m{index}").unlink()
+    delay_truth(build_mission(folder, num_hypotheses=3))
     assert evaluate_folder(folder, EvaluateConfig(rivals=(), num_resamples=20), QUIET).summary["num_failed"] == 1
     with pytest.raises(InputError, match="no mission directory"):
         evaluate_folder(tmp_path / "missions" / "m0", SIMPLE, QUIET)
