@@ -35,7 +35,7 @@ PAGES = {
     "network": ("rendezvous", "attention_cost", "place_ablations", "library_draws"),
     "association": ("association", "clutter"),
     "detections": ("measurement_noise", "height"),
-    "evidence": ("silence",),
+    "evidence": ("silence", "bearings"),
     "logs": ("log_reading", "plausibility", "log_writing"),
     "runs": ("run_cost", "batch", "batch_engines", "memory", "many_agents"),
     "rivals": (),
