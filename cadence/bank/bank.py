@@ -33,6 +33,8 @@ from cadence.types import Detections, HypothesisSet, WindowBatch
 
 _NUM_EM_ROUNDS = 30
 _MAX_PAIRS = 1024
+NEAR_STEPS = 0.3
+"""Detections at least so far apart show a velocity and how it changes; all of a burst would rule."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,6 +58,7 @@ class Bank:
     models       C motion models in units of steps and step lengths
     log_weight   [C] log of the prior weights; equal where None
     later_weight [C] weights of the models that take over after the last detection; the prior weights where None
+    near_weights the same two [C] where detections nearer to each other are believed as well (`near`)
     speed_mps    the log's typical speed: one step length is speed_mps * step_s; None until fitted
     switch_rate  how often, per step, the model changes after the last detection
     temper       exponent of the likelihood when models are weighed
@@ -68,6 +71,7 @@ class Bank:
     models: MotionModels = dataclasses.field(default_factory=default_models)
     log_weight: Tensor | None = None
     later_weight: Tensor | None = None
+    near_weights: tuple[Tensor, Tensor] | None = None
     speed_mps: float | None = None
     switch_rate: float = 1.0 / 32.0
     temper: float = 1.0
@@ -94,7 +98,18 @@ class Bank:
         telling = spaced(rows, self.spacing_steps * step_s)
         models = concatenate(self.models, fit_ornstein_uhlenbeck(telling, step_s, speed_mps))
         log_weight, evidence = em_weights(log_likelihood(models, telling, step_s, speed_mps), self.pseudo_count)
-        return dataclasses.replace(self, models=models, log_weight=log_weight, later_weight=evidence, speed_mps=speed_mps)
+        near = spaced(rows, NEAR_STEPS * step_s)
+        near_weights = em_weights(log_likelihood(models, near, step_s, speed_mps), self.pseudo_count)
+        learned = dataclasses.replace(self, log_weight=log_weight, later_weight=evidence, near_weights=near_weights)
+        return dataclasses.replace(learned, models=models, speed_mps=speed_mps)
+
+    @property
+    def near(self) -> "Bank":
+        """The bank with its models weighed by detections within bursts as well, which show how a target moves."""
+        if self.near_weights is None:
+            return self
+        log_weight, later_weight = self.near_weights
+        return dataclasses.replace(self, spacing_steps=NEAR_STEPS, log_weight=log_weight, later_weight=later_weight)
 
     def posterior(self, windows: WindowBatch, num_hypotheses: int, evidence: Tensor | None = None) -> BankPosterior:
         """Moments and joint samples for the active agents of `windows`, rows in the order of `is_active.nonzero()`.

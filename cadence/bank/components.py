@@ -115,6 +115,8 @@ def default_models() -> MotionModels:
         ornstein_uhlenbeck([0.3, 1.0], [2.5, 5.0], [0.0]),
         ornstein_uhlenbeck([30.0, 300.0], [0.7], turns),
         home_ranges([2.0, 10.0], [0.5, 1.0], [1.0, 3.0, 10.0, 30.0]),
+        # the way between detections far apart is shorter than the one flown: who circles is faster than the log's usual speed
+        home_ranges([0.7, 2.0, 10.0], [2.0], [1.0, 3.0, 10.0, 30.0]),
     )
 
 

@@ -91,10 +91,10 @@ def settings_of(bank: Bank) -> tuple[Bank, ...]:
     forgets = ~bank.models.has_home & (bank.models.relaxation_rate > _FORGETS)
     return (
         bank,
-        dataclasses.replace(bank, noise_steps=_NOISE_STEPS),
+        dataclasses.replace(bank.near, noise_steps=_NOISE_STEPS),
         bank.only(bank.models.has_home),
-        dataclasses.replace(bank.only(forgets), noise_steps=_NOISE_STEPS),
-        dataclasses.replace(bank, noise_steps=_NOISE_STEPS, temper=_TEMPER),
+        dataclasses.replace(bank.near.only(forgets), noise_steps=_NOISE_STEPS),
+        dataclasses.replace(bank.near, noise_steps=_NOISE_STEPS, temper=_TEMPER),
     )
 
 

@@ -104,14 +104,15 @@ class Plan:
         num_rows, bank = len(tracks), members[0]
         length_m = bank.length_m(timeline.step_s)
         extra_m = torch.zeros(len(member), dtype=torch.float64)
-        evidence: dict[float, Tensor] = {}
+        evidence: dict[tuple[float, float], Tensor] = {}
         chains = {}
         for index in sorted(set(member.tolist())):
             each = members[index]
-            if each.noise_steps not in evidence:
+            key = each.noise_steps, each.spacing_steps
+            if key not in evidence:
                 floored = with_floor(tracks.rows, each.noise_steps * length_m)
-                evidence[each.noise_steps] = stretch_evidence(each, floored, timeline)
-            chains[index] = Chains.of(each, each.temper * evidence[each.noise_steps], timeline)
+                evidence[key] = stretch_evidence(each, floored, timeline)
+            chains[index] = Chains.of(each, each.temper * evidence[key], timeline)
             extra_m[member == index] = (each.noise_steps**2 + FLOOR_STEPS**2) ** 0.5 * length_m
         row = torch.arange(num_rows).repeat_interleave(len(member))
         floor = extra_m.repeat(num_rows)[:, None, None, None] ** 2 * torch.eye(2, dtype=torch.float64)
