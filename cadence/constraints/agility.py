@@ -35,7 +35,7 @@ class Agility:
         cls,
         acceleration_mps2: float | None,
         turn_rate_dps: float | None,
-        longest_m: float | None,
+        longest_m: float | Tensor | None,
         step_s: float,
         length_m: float,
     ) -> "Agility":

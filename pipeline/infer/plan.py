@@ -129,12 +129,13 @@ class Plan:
         heard = (*beside.evidence, *silence.evidence, *measured.evidence)
         num, evidence = config.num_hypotheses, heard if config.evidence.is_used else ()
         if seen.associated is None:
-            weighed: Estimator = WithEvidence(fitted.estimator, config.evidence, loaded.is_apart, loaded.num_past)
+            weighed = WithEvidence(fitted.estimator, config.evidence, loaded.is_apart, loaded.num_past)
+            drawing: Estimator = weighed
             if measured.evidence:
                 bank = data.fitted_bank().members[0]
-                weighed = drawn_by_measurements(weighed, bank, config.evidence, config.guidance, seen.sources.grid.step_s)
+                drawing = drawn_by_measurements(weighed, bank, config.evidence, config.guidance, seen.sources.grid.step_s)
             located = seen.named.located(beside.start_ns, beside.obstacles, evidence)
-            draws = draw_windows(weighed, located, num, loaded.is_apart)
+            draws = draw_windows(drawing, located, num, loaded.is_apart)
         else:
             associated = seen.associated.located(beside.start_ns, beside.obstacles, evidence)
             draw = draw_tracks if loaded.is_apart else draw_associations
