@@ -25,8 +25,8 @@ straight way says little of the speed."""
 
 _LEAST, _MOST = 1.0, 1.25
 """Of 24 patrols and 23 recordings of aircraft, ships and a drone, seen 5 to 30 % of the time, the speed that one true step of
-the grid in a thousand exceeds is .92 to 1.14 times the fastest that was seen (eight in ten), half of them .98 to 1.07. Up to 1.12
-the regions of twelve other patrols held 5 to 7 % less of the truth, up to 1.25 as much as without a limit."""
+the grid in a thousand exceeds is .92 to 1.14 times the fastest that was seen (eight in ten), half of them .98 to 1.07. Up to
+1.12 the regions of twelve other patrols held 5 to 7 % less of the truth, up to 1.25 as much as without a limit."""
 
 _PLACES = math.sqrt(2.0) - 1.0
 """Of places that have nothing to do with those by which a pool shares hypotheses out."""
