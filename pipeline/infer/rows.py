@@ -100,6 +100,7 @@ def window_rows(windows: MissionWindows, part: Tensor, drawn: HypothesisSet, max
 def with_effective(rows: pa.Table, drawn: HypothesisSet) -> pa.Table:
     """WINDOWS rows of some windows with the effective sample size of each agent's tracks; null where nothing weighs them."""
     num = np.full(rows.num_rows, np.nan) if drawn.num_effective is None else drawn.num_effective.numpy().reshape(-1)
+    num = num.astype(np.float32).astype(np.float64)  # as exact as weights are written; the last bits depend on the process
     return rows.append_column(NUM_EFFECTIVE, pa.array(num, pa.float64(), from_pandas=True))
 
 
