@@ -299,16 +299,35 @@ _NO_NAMES = {"", "-1", "none", "null", "nil", "nan", "n/a", "unknown", "unidenti
 """How messages and topics say that there is no identity."""
 
 
+_UUID_BYTES = 16
+"""Of 16 bytes without a name of their own, text fills all, or has nothing but zeros behind it."""
+
+
 def _name(value: Any) -> str | None:
     """An identity as text; None for none. UUIDs as bytes or numbers become hexadecimal."""
-    if value is None or (isinstance(value, str | int) and str(value).strip().lower() in _NO_NAMES):
+    if value is None:
         return None
     if isinstance(value, str | int):
-        return str(value)
+        text = _unpadded(str(value))
+        return None if text.lower() in _NO_NAMES else text
     if isinstance(value, float) and value.is_integer():
         return str(int(value))
     inner = value.get("uuid", value) if isinstance(value, dict) else getattr(value, "uuid", value)
     try:
-        return bytes(inner).hex()
+        octets = bytes(inner)
     except (TypeError, ValueError):
         return str(inner)
+    letters = _letters(octets) if inner is value else None
+    return octets.hex() if letters is None else _name(letters)
+
+
+def _unpadded(text: str) -> str:
+    """The text without what fills its field up: spaces, what stands behind a zero byte, the @ of AIS."""
+    return text.partition("\0")[0].rstrip("@").strip()
+
+
+def _letters(octets: bytes) -> str | None:
+    """The text in an array of characters; None where the bytes are none."""
+    text, _, rest = octets.partition(b"\0")
+    is_text = text.isascii() and text.decode("latin-1").isprintable()
+    return text.decode() if is_text and text and not (len(octets) == _UUID_BYTES and any(rest)) else None

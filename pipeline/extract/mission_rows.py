@@ -33,7 +33,7 @@ from pipeline.extract.thinning import ThinningConfig, is_seen, noise
 from pipeline.extract.transform_messages import LogTransforms
 from pipeline.extract.transforms import Limits
 from pipeline.extract.units import in_true_units
-from pipeline.extract.unmeasured import check_wrapped, with_rounding, without_frozen
+from pipeline.extract.unmeasured import check_wrapped, with_rounding, without_frozen, without_held
 from pipeline.extract.writing_order import without_set_back_unnumbered
 from pipeline.logs.health import utc
 from pipeline.logs.reader import MissionLog
@@ -141,8 +141,8 @@ def _columns(parts: Sequence[Positions], counts: Counter[str]) -> Positions:
     counts["out_of_order"] += sum(int((part.time_ns < np.maximum.accumulate(part.time_ns)).sum()) for part in parts)
     rows = Positions.concatenate(list(parts) or [Rows().finish()])
     is_finite = np.isfinite(rows.first) & np.isfinite(rows.second)
-    # A latitude off the earth, or metres beyond the moon, are as little a position as NaN.
-    is_finite &= ~rows.is_geodetic | ((np.abs(rows.first) <= 90) & (np.abs(rows.second) <= 360))
+    # A latitude off the earth, AIS's longitude for none, or metres beyond the moon, are as little a position as NaN.
+    is_finite &= ~rows.is_geodetic | ((np.abs(rows.first) <= 90) & (np.abs(rows.second) <= 360) & (rows.second != 181))
     is_finite &= rows.is_geodetic | (np.maximum(np.abs(rows.first), np.abs(rows.second)) <= _MAX_FAR_M)
     counts["dropped_nonfinite"] += int((~is_finite).sum())
     rows = rows[is_finite]
@@ -166,7 +166,8 @@ def _in_place(
         (reader, in_true_units(reader.source, role, rows, suspicions)) for (reader, _), rows in zip(parts, timed, strict=True)
     ]
     found = [(reader, heights_in_metres(reader.source, role, rows, suspicions)) for reader, rows in found]
-    filled = [(reader, without_frozen(without_fill_ins(rows, role, suspicions), role, suspicions)) for reader, rows in found]
+    found = [(reader, without_held(without_fill_ins(rows, role, suspicions), role, suspicions)) for reader, rows in found]
+    filled = [(reader, without_frozen(rows, role, suspicions)) for reader, rows in found]
     for _, rows in filled:
         check_wrapped(rows, role, suspicions)
     return [(reader, with_rounding(rows, role, reader.source.sigma_m is not None, suspicions)) for reader, rows in filled]
@@ -204,7 +205,10 @@ def _check_any(role: str, rows: Positions, counts: Counter[str], suspicions: Sus
     elif counts["unmet"]:
         reason = "no position meets the conditions of `where`; correct the [extract] entries"
     elif counts["no_fix"]:
-        reason = "every position is marked as having no fix; map another topic (cadence info lists them)"
+        reason = (
+            "every position is marked as none (no fix, or what is no target, as a list that is drawn); map another topic "
+            "(cadence info lists them)"
+        )
     elif counts["incomplete"]:
         reason = "no message of the mapped topics has a position where the mapping looks for it; correct the [extract] entries"
     elif counts["outside_time_cut"]:

@@ -18,6 +18,7 @@ from pipeline.suspicions import Suspicions
 _MIN_ROWS: Final = 3
 _NEAR_DEG: Final = 1.0
 _FAR_DEG: Final = 5.0
+_TURN_DEG: Final = 360.0
 _MAX_TURNS: Final = 3
 """Of sources that go from one reading to the other more often each may be another target's."""
 _MAX_REACH_MPS: Final = 1e3
@@ -47,7 +48,7 @@ def in_one_reading(rows: Positions, role: str, suspicions: Suspicions) -> Positi
     if len(told) < 2 * _MIN_ROWS:
         return rows
     able = told[(np.abs(places[told]) <= [90, 360]).all(axis=1)]
-    is_far = (np.abs(places[told] - places[able[:1]]) > _FAR_DEG).any(axis=1)
+    is_far = (_apart_deg(places[told], places[able[:1]]) > _FAR_DEG).any(axis=1)
     if not len(able) or min(is_far.sum(), (~is_far).sum()) < _MIN_ROWS:
         return rows
     groups = [told[~is_far], told[is_far]]
@@ -55,7 +56,7 @@ def in_one_reading(rows: Positions, role: str, suspicions: Suspicions) -> Positi
     for one, other in (groups, groups[::-1]) if turns else ():
         centre = np.median(places[other], axis=0)
         for word, made in {**_UNITS, **(_MIRRORS if turns <= _MAX_TURNS else {})}.items():
-            if not (np.abs(made(places[one]) - centre) < _NEAR_DEG).all():
+            if not (_apart_deg(made(places[one]), centre) < _NEAR_DEG).all():
                 continue
             is_mirror = word in _MIRRORS
             if is_mirror and len(one) > len(other):
@@ -68,14 +69,20 @@ def in_one_reading(rows: Positions, role: str, suspicions: Suspicions) -> Positi
     return rows
 
 
+def _apart_deg(places: Float64s, others: Float64s) -> Float64s:
+    """Differences [N, 2] of latitudes and longitudes; 179 and -179 are 2 apart, as 359 and 1 are."""
+    apart = np.abs(places - others)
+    apart[:, 1] = np.where(apart[:, 1] <= _TURN_DEG, np.minimum(apart[:, 1], _TURN_DEG - apart[:, 1]), apart[:, 1])
+    return apart
+
+
 def _leaps(rows: Positions, is_far: Bools) -> int:
     """How often a target goes over to the other group of rows [N]; 0 where one could, or none does."""
     order = np.lexsort((rows.time_ns, rows.agents.number))
     turns = np.flatnonzero((np.diff(is_far[order]) != 0) & (np.diff(rows.agents.number[order]) == 0))
     before, after = order[turns], order[turns + 1]
-    way_m = DEGREE_M * np.abs(rows.first[after] - rows.first[before]) + DEGREE_M * np.abs(
-        rows.second[after] - rows.second[before]
-    )
+    places = np.column_stack([rows.first, rows.second])
+    way_m = DEGREE_M * _apart_deg(places[after], places[before]).sum(axis=1)
     is_leap = way_m > _MAX_REACH_MPS * (rows.time_ns[after] - rows.time_ns[before]) * 1e-9
     return len(turns) if is_leap.all() else 0
 

@@ -80,6 +80,7 @@ def in_degrees(rows: Positions, unit: Unit) -> Positions:
 def of_degrees(rows: Positions) -> Evidence | None:
     """What fields of degrees hold, where it is not degrees."""
     is_stated = np.isfinite(rows.first) & np.isfinite(rows.second) & ((rows.first != 0) | (rows.second != 0))
+    is_stated &= rows.first != rows.second  # as devices write what they do not know: -1, 999, -2e10
     rows = rows[is_stated & (np.abs(rows.first) != _AIS_NONE[0]) & (np.abs(rows.second) != _AIS_NONE[1])]
     if len(rows) < 2:
         return None

@@ -1,6 +1,6 @@
 """Positions that were not measured as they stand: repeated while the target went on, run over, or rounded degrees."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Final
 
 import numpy as np
@@ -21,9 +21,66 @@ _DECIMALS: Final = (1, 2, 3)
 _MIN_ROWS: Final = 10
 _MIN_PLACES: Final = 3
 _UNIFORM: Final = 12.0**0.5
+_MIN_HELD: Final = 8
+_MIN_REPEATED: Final = 0.5
+_MAX_HELD: Final = 3.0
+"""Of the places of a target at least so many, and half of them, are repeated; for three times as long as usual it stands."""
+_GRIDS_M: Final = (1.0, 0.5, 0.1, 0.05, 0.01)
+_GRIDS_DEG: Final = (1.0, 0.1, 0.01, 1e-3, 1e-4, 1e-5, 1e-6)
+_GRID_STEPS: Final = 1.5
+_GRID_TOLERANCE: Final = 1e-6
+"""Of what is rounded, and moves by one step of that at a time, every row tells something."""
 _STEPS_M: Final = (0.001, 0.01, 0.1, 1.0)
 """Units in which sensors count metres in 16 bits."""
 _SMALL: Final = 0.1
+
+
+def without_held(rows: Positions, role: str, suspicions: Suspicions) -> Positions:
+    """The rows of one reader that tell something new, where most positions of its targets are told several times.
+
+    A node that publishes faster than its receiver measures, or a list of all that was heard lately, tells the last position
+    again with a fresh stamp. What is told for longer than as a rule may stand, and stays.
+    """
+    if role != "detections" or len(rows) < 2 * _MIN_HELD or not suspicions.looks_for("place"):
+        return rows
+    place, is_held = np.column_stack([rows.first, rows.second]), np.zeros(len(rows), np.bool_)
+    grids = _GRIDS_DEG if rows.is_geodetic[0] else _GRIDS_M
+    for track in _tracks(rows):
+        moments = track[np.diff(rows.time_ns[track], prepend=-1) != 0]  # what is sent twice is no matter
+        is_held[moments] = _held(place[moments], grids)
+    if not is_held.any():
+        return rows
+    suspicions.add(
+        "place", str(rows.topic[0]),
+        seen=f"{int(is_held.sum())} of {len(rows)} positions tell the one before again to the last digit, while targets move "
+        "on: it is published more often than measured",
+        done="the first of each is used",
+        setting=f'where in its [[extract.{role}]], or extract.trusted = ["place"]',
+    )  # fmt: skip
+    return rows[~is_held]
+
+
+def _held(place: Float64s, grids: Sequence[float]) -> Bools:
+    """Which rows [N] of a track tell again where a moving target was; what moves by steps of a grid does not."""
+    found = np.zeros(len(place), np.bool_)
+    begin = np.flatnonzero(np.concatenate([[True], (np.diff(place, axis=0) != 0).any(axis=1)]))
+    length = np.diff(np.append(begin, len(place)))
+    is_repeated = length > 1
+    if is_repeated.sum() < max(_MIN_HELD, _MIN_REPEATED * len(begin)) or not np.isfinite(place).all():
+        return found
+    step = float(np.median(np.abs(np.diff(place[begin], axis=0)).max(axis=1)))
+    if step <= _GRID_STEPS * next((grid for grid in grids if _are_multiples(place, grid)), 0.0):
+        return found
+    usual = float(np.median(length[is_repeated]))
+    for first, number in zip(begin[is_repeated].tolist(), length[is_repeated].tolist(), strict=True):
+        if number <= _MAX_HELD * usual:
+            found[first + 1 : first + number] = True
+    return found
+
+
+def _are_multiples(place: Float64s, grid: float) -> bool:
+    scaled = place / grid
+    return bool((np.abs(scaled - np.rint(scaled)) < _GRID_TOLERANCE).all())
 
 
 def without_frozen(rows: Positions, role: str, suspicions: Suspicions) -> Positions:

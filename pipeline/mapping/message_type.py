@@ -129,9 +129,9 @@ def geodetic(schema: str, point: str = "", vertical_datum: VerticalDatum = "not 
 
 
 def stamped_items(known: MessageType, item: str) -> MessageType:
-    """The type where a message without a stamp or a frame of its own has them in its items ("detections[:].")."""
+    """The type whose items ("detections[:].") have stamps and frames of their own; where they are empty, the message's."""
     return replace(
         known,
-        time=(*TIME_PATHS, *(f"{item}{path}" for path in TIME_PATHS)),
-        frame_id=(*FRAME_PATHS, *(f"{item}{path}" for path in FRAME_PATHS)),
+        time=(*(f"{item}{path}" for path in TIME_PATHS), *TIME_PATHS),
+        frame_id=(*(f"{item}{path}" for path in FRAME_PATHS), *FRAME_PATHS),
     )

@@ -7,6 +7,8 @@ from pipeline.mapping.message_type import FRAME_PATHS, TIME_PATHS, MessageType, 
 
 _TRANSFORM = "transform.translation"
 _MARKERS = "markers[:]"
+_LISTS = (4, 5, 6, 7, 8, 11)
+"""Types of markers that draw a list of points: their pose is where these count from."""
 
 POSES: Final[dict[str, MessageType]] = {
     "PointStamped": metric("geometry_msgs.PointStamped", "point"),
@@ -73,14 +75,14 @@ POSES: Final[dict[str, MessageType]] = {
     ),
     "Marker": replace(
         metric("visualization_msgs.Marker", "pose.position"),
-        where=("action == 0",),
+        where=("action == 0", *(f"type != {number}" for number in _LISTS)),
         agent=("id",),
         names_agents=True,
         is_suggested=False,
     ),
     "MarkerArray": replace(
         stamped_items(metric("visualization_msgs.MarkerArray", f"{_MARKERS}.pose.position"), f"{_MARKERS}."),
-        where=(f"{_MARKERS}.action == 0",),
+        where=(f"{_MARKERS}.action == 0", *(f"{_MARKERS}.type != {number}" for number in _LISTS)),
         agent=(f"{_MARKERS}.id",),
         names_agents=True,
         is_suggested=False,

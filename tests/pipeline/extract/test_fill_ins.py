@@ -31,6 +31,13 @@ def test_a_receiver_without_a_fix_that_does_not_say_so(tmp_path: Path, place: tu
     assert f"{len(times)} of 90 positions are at {place[0]:g}, {place[1]:g}" in suspicion["seen"]
 
 
+@pytest.mark.parametrize("place", [(91.0, 11.6), (48.1, 181.0)])
+def test_half_of_what_a_ship_sends_instead_of_its_place(tmp_path: Path, place: tuple[float, float]) -> None:
+    found = run(tmp_path, [fix(float(i), *place) if i % 6 == 0 else drive(1, i)[0] for i in range(60)])
+    assert (found.summary["num_detections"], found.summary["dropped_nonfinite"]) == (50, 10)
+    assert float(np.abs(np.asarray(found.detections["x_m"])).max()) < 10.0 and found.summary["suspicions"] == []
+
+
 @pytest.mark.parametrize("place", [(1.0, 1.0), (48.1, 48.1), (0.0, 11.6), (1e-7, -1e-7)])
 def test_degrees_that_look_written(tmp_path: Path, place: tuple[float, float]) -> None:
     found = run(tmp_path, [fix(float(i), *place) if 20 <= i < 30 else drive(1, i)[0] for i in range(60)])

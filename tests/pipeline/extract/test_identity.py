@@ -51,6 +51,24 @@ def test_a_detector_that_never_fills_in_its_ids(tmp_path: Path) -> None:
         assert sorted(set(found.detections["y_m"].to_pylist())) == [y for y, _ in lanes[:num]]
 
 
+@pytest.mark.parametrize(
+    ("names", "called"),
+    [
+        (["DLH1", "DLH1    ", " DLH1"], {"DLH1"}),
+        (["DLH1", "DLH1\0\0", "DLH1@@@"], {"DLH1"}),
+        ([[*b"DLH1", 0, 0, 0], [*b"DLH1", 0, 7, 9]], {"DLH1"}),
+        ([[*b"DLH1", *[0] * 12]], {"DLH1"}),
+        ([[*b"DLH1", 0, *[200] * 11]], {"444c4831" + "00" + "c8" * 11}),
+        ([[200, 1, 2, 3]], {"c8010203"}),
+        (["@@@@", "    ", "UNKNOWN "], {None}),
+    ],
+)
+def test_names_in_fields_that_are_longer(tmp_path: Path, names: list[Any], called: set[str | None]) -> None:
+    """Padded with spaces, zeros or the @ of AIS; an array of characters is text, of 16 bytes mostly none."""
+    rows = [detection(float(i), 3.0 * i, 0.0, agent_id=names[i % len(names)]) for i in range(12)]
+    assert set(agents(run(tmp_path, rows))) == called
+
+
 def test_a_named_topic_of_arrays_is_a_sensors(tmp_path: Path) -> None:
     rows = [array("/detections/lidar_front", i, [(3.0 * i, y) for y in (0.0, 300.0, 600.0)]) for i in range(20)]
     found = run(tmp_path, rows)

@@ -273,6 +273,23 @@ def test_a_source_that_changes_in_its_midst(tmp_path: Path, reading: Any, words:
         assert where(found) == pytest.approx((48.1, 11.6045), abs=0.01) and max(east_and_north(found)) < 700.0
 
 
+@pytest.mark.parametrize("longitude", [lambda degrees: (degrees + 180.0) % 360.0 - 180.0, lambda degrees: degrees])
+def test_a_way_over_the_antimeridian_is_one(tmp_path: Path, longitude: Any) -> None:
+    rows = [fix(float(i), -17.0, longitude(179.99123 + 1e-3 * i), topic="/target/fix") for i in range(60)]
+    found = run(tmp_path, rows)
+    assert (found.summary["num_detections"], found.summary["suspicions"]) == (60, [])
+    assert max(east_and_north(found)) == pytest.approx(59 * 106.5, rel=0.01)
+
+
+@pytest.mark.parametrize("unknown", [-2e10, -999.0])
+def test_radians_of_a_receiver_that_says_what_it_does_not_know(tmp_path: Path, unknown: float) -> None:
+    places = np.radians(np.column_stack([48.1 + 5e-5 * np.arange(60), 11.6 + 1e-4 * np.arange(60)]))
+    places[:20] = unknown
+    found = run(tmp_path, [fix(float(i), *place, topic="/target/fix") for i, place in enumerate(places)])
+    assert found.summary["num_detections"] == 40 and where(found) == pytest.approx((48.1, 11.604), abs=0.01)
+    assert "radians" in found.summary["suspicions"][0]["seen"]
+
+
 def test_targets_on_both_sides_of_greenwich(tmp_path: Path) -> None:
     """Ships without names, seen in turn, are no target that leaps."""
     rows = [fix(float(i), 50.0 + 1e-4 * i, 3.0 if i % 2 else -3.0, topic="/ais/detections") for i in range(40)]

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fixtures.small_logs import Row, detection, fix
+from fixtures.small_logs import Row, detection, fix, time_ns
 from test_extract import fails, run
 
 from cadence.errors import InputError
@@ -47,6 +47,12 @@ def standing() -> np.ndarray:
     return place_m
 
 
+def now_and_then() -> np.ndarray:
+    place_m = way()
+    place_m[1:30:2] = place_m[0:30:2]
+    return place_m
+
+
 def teleporting() -> np.ndarray:
     """It is somewhere else afterwards: another target, or carried there."""
     place_m = way()
@@ -57,12 +63,41 @@ def teleporting() -> np.ndarray:
 
 @pytest.mark.parametrize(
     "place_m",
-    [standing(), np.repeat(way()[::5], 5, axis=0), np.repeat(way()[::30], 30, axis=0), teleporting(), way()],
-    ids=["stands", "each five times", "each thirty times", "elsewhere", "measured"],
+    [
+        standing(),
+        np.repeat(way()[::30], 30, axis=0),
+        teleporting(),
+        way(),
+        np.rint(0.2 * way()),
+        now_and_then(),
+    ],
+    ids=["stands", "each thirty times", "elsewhere", "measured", "in whole metres", "now and then"],
 )
 def test_what_repeats_itself_in_another_way_is_left_as_it_is(tmp_path: Path, place_m: np.ndarray) -> None:
     found = run(tmp_path, seen(place_m))
     assert not [told for told in found.summary["suspicions"] if "to the last digit" in told["seen"]]
+
+
+@pytest.mark.parametrize(("is_geodetic", "agent"), [(True, "a"), (False, "a"), (False, None)])
+@pytest.mark.parametrize("length", [(5,), (1, 2, 4, 3)])
+def test_positions_that_are_published_more_often_than_measured(
+    tmp_path: Path, length: tuple[int, ...], is_geodetic: bool, agent: str | None
+) -> None:
+    """As by a list of all aircraft that were heard lately: a position stays in it until there is another one."""
+    shown = np.repeat(np.arange(NUM), np.resize(length, NUM))[:NUM]
+    place_m = way()[np.maximum.accumulate(np.concatenate([[0], np.flatnonzero(np.diff(shown)) + 1])[shown])]
+    found = run(tmp_path, seen(place_m, is_geodetic, agent))
+    assert len(found.detections) == len(np.unique(shown))
+    (told,) = found.summary["suspicions"]
+    assert told["kind"] == "place" and "published more often than measured" in told["seen"]
+    assert found.detections["time_ns"].to_pylist() == [time_ns(float(row)) for row in np.unique(shown, return_index=True)[1]]
+
+
+def test_a_target_that_stops_between_positions_told_twice_stays(tmp_path: Path) -> None:
+    place_m = np.repeat(way()[: NUM // 2], 2, axis=0)
+    place_m[90:] -= place_m[90] - place_m[60] - [8.0, 0.0]
+    place_m[60:90] = place_m[60]
+    assert len(run(tmp_path, seen(place_m)).detections) == 45 + 30
 
 
 def test_a_target_that_stood_before_a_silence_is_believed(tmp_path: Path) -> None:

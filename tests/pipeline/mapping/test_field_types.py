@@ -312,6 +312,9 @@ def test_what_is_drawn_can_be_read_when_told(tmp_path: Path) -> None:
         tmp_path, ROS, ROS("visualization_msgs/msg/MarkerArray", markers=[marker(7, 0), marker(8, 2), marker(9, 0)])
     )
     assert rows.agent.tolist() == ["7", "9"] and rows.first.tolist() == [1.5] * 2 and rows.frame_id.tolist() == ["odom"] * 2
+    points = ROS("visualization_msgs/msg/Marker", header=ROS.header(), type=8, points=[ROS.point()])
+    (tmp_path / "points").mkdir()
+    assert len(read_ros(tmp_path / "points", ROS, points)[0]) == 0  # their pose is only where the points count from
     poses = [ROS("geometry_msgs/msg/PoseStamped", header=ROS.header("odom", START_NS + i), pose=ROS.pose()) for i in (5, 6)]
     (tmp_path / "path").mkdir()
     rows, _ = read_ros(tmp_path / "path", ROS, ROS("nav_msgs/msg/Path", header=ROS.header(), poses=poses))

@@ -140,6 +140,14 @@ def test_detection_array_whose_header_only_its_items_fill_in(tmp_path: Path) -> 
     np.testing.assert_array_equal(rows.score, [0.5, np.nan])
 
 
+def test_detections_from_several_sensors_keep_their_own_stamps_and_frames(tmp_path: Path) -> None:
+    one, other = HUMBLE.detection("a", 1.0), HUMBLE.detection("b", 2.0)
+    one.header, other.header = HUMBLE.header("cam", START_NS + 1), HUMBLE.header("lidar", START_NS + 2)
+    message = HUMBLE("vision_msgs/msg/Detection3DArray", header=HUMBLE.header("map", START_NS + 9), detections=[one, other])
+    rows, _ = read(tmp_path, [HUMBLE.cdr_row(message)])
+    assert rows.time_ns.tolist() == [START_NS + 1, START_NS + 2] and rows.frame_id.tolist() == ["cam", "lidar"]
+
+
 @pytest.mark.parametrize("encoding", ["ros2msg", "ros2idl"])
 def test_radar_tracks(tmp_path: Path, encoding: str) -> None:
     upper = np.array([4.0, 1.0, 0.5, 9.0, 0.25, 16.0], np.float32)
