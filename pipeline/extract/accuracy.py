@@ -26,6 +26,9 @@ _MIN_VAGUE_M: Final = 100.0
 _VAGUE_RATIO: Final = 1000.0
 """Smoothed positions scatter less than they are off, by a hundred times at most; by a thousand where a driver writes 1e6 m²."""
 _SURE_RATIO: Final = 10.0
+_EASY_MPS2: Final = 0.05
+_BEND: Final = 6.0**0.5
+"""Of noise in the second differences of positions. What walks from cell to cell of a grid once a minute seems to be noisy."""
 _LEAST_M: Final = 1e-3
 _ABSURD_RATIO: Final = 1000.0
 """A receiver that has just resolved its ambiguities claims to be some hundred times as exact as before, never below this."""
@@ -169,13 +172,19 @@ def _is_contradicted(source: _Source, covariance_m2: Float64s, suspicions: Suspi
     noise = None
     if is_vague or most_m > _SURE_RATIO * stated_m:
         noise = measurement_noise(source.ways)
-    is_sure = noise is not None and noise.sigma_interval_m[0] > _SURE_RATIO * stated_m
+    is_sure = noise is not None and noise.sigma_interval_m[0] > max(_SURE_RATIO * stated_m, _could_be_motion_m(source))
     if noise is None or not (is_vague or is_sure):
         return False
     done = f"{noise.sigma_m:.3g} m are taken" if noise.is_sure else "taken as not stated"
     seen = f"a standard deviation of {stated_m:.3g} m is stated, but the detections scatter by {noise.sigma_m:.3g} m"
     suspicions.add("covariance", source.name, seen=seen, done=done, setting='extract.trusted = ["covariance"]')
     return True
+
+
+def _could_be_motion_m(source: _Source) -> float:
+    """The scatter that nobody needs noise to make, between detections as far apart as they mostly are."""
+    steps_s = np.concatenate([np.diff(way.time_s) for way in source.ways])
+    return _EASY_MPS2 * float(np.median(steps_s)) ** 2 / _BEND if len(steps_s) else 0.0
 
 
 def _sources(rows: Positions, kinds: Mapping[str, str]) -> list[_Source]:

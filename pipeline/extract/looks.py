@@ -24,6 +24,8 @@ _BRACKET_LOOKS: Final = 2.5
 """An agent's place is known at a look between two detections, neither of which is further away than so many looks."""
 _LEAST_TRUST: Final = 0.5
 _NEAR_SIGMAS: Final = 3.0
+_MIN_SEEN: Final = 10
+"""Of so many detections one may lie where a table of P(detect) has ended before it is zero."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -256,7 +258,8 @@ def _trust(
         chance = np.max([detection_probability(curve, config.area(), nearer, *ways) for curve in curves], axis=0)
         num_seen, num_outside = num_seen + len(rows), num_outside + int((chance <= 0).sum())
         farthest_m = max(farthest_m, float(away[chance <= 0].max(initial=0.0)))
-    if not num_outside or not suspicions.looks_for("place"):
+    is_chance = num_outside == 1 and num_seen >= _MIN_SEEN
+    if not num_outside or is_chance or not suspicions.looks_for("place"):
         return 1.0
     share = 1.0 - num_outside / num_seen
     trust = share if share >= _LEAST_TRUST else 0.0

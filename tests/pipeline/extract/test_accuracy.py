@@ -106,6 +106,14 @@ def test_statements_that_cannot_be_meant(tmp_path: Path, way: Callable[[], np.nd
     assert trusted.summary["suspicions"] == [] and set(trusted.detections["cov_xx_m2"].to_pylist()) == {stated_m2}
 
 
+def test_a_walk_over_the_cells_of_a_grid_once_a_minute_contradicts_nothing(tmp_path: Path) -> None:
+    """Cells of 21 m; it sways by one or two of them, as any walker may in a minute."""
+    sway = np.random.default_rng(4).integers(-2, 3, 240)
+    walk = 21.0 * np.column_stack([7 * np.arange(240), sway])
+    slow = [detection(60.0 * i, *place, agent_id="a", covariance=[1.0, 0.0, 0.0, 1.0]) for i, place in enumerate(walk.tolist())]
+    assert run(tmp_path, slow).summary["suspicions"] == []
+
+
 @pytest.mark.parametrize(("sigma_m", "stated_m"), [(2.0, 2.0), (2.0, 0.5), (0.0, 15.0), (0.05, 3.0), (30.0, 500.0)])
 def test_statements_that_can_be_meant(tmp_path: Path, sigma_m: float, stated_m: float) -> None:
     """A receiver smooths: its positions scatter by centimetres and are off by metres."""

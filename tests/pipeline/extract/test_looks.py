@@ -95,6 +95,17 @@ def test_what_contradicts_detections_is_told_and_softened(tmp_path: Path) -> Non
     assert read_footprints(folder)[0].trust == 1.0
 
 
+@pytest.mark.parametrize(("num", "is_told"), [(5, True), (11, False)])
+def test_one_of_many_detections_beyond_the_table_is_chance(tmp_path: Path, num: int, is_told: bool) -> None:
+    seen = [detection(0.9 * i, 9.0 * i, 10.0, sensor="plane", agent_id="T0") for i in range(num)]
+    rows = sorted(
+        [*flight()[:11], *seen, detection(9.95, 99.0, 60.0, sensor="plane", agent_id="T0")], key=lambda row: row.time_s
+    )
+    found = run(tmp_path, rows, poses=POSES, sensors=[DISC])
+    assert [line["kind"] for line in found.summary["suspicions"]] == ["place"] * is_told
+    assert (read_footprints(tmp_path)[0].trust < 1.0) == is_told
+
+
 def test_a_curve_is_fitted_on_other_times_than_it_is_used_at(tmp_path: Path) -> None:
     """A target goes to and fro before a mast; a second sensor always knows where it is."""
     law = DetectionCurve(np.array([0.0, 300.0, 900.0]), np.array([0.8, 0.8, 0.0]))
