@@ -5,6 +5,8 @@ told as a suspicion.
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Final
 
 import numpy as np
 
@@ -15,6 +17,7 @@ from pipeline.extract.positions import Positions
 from pipeline.mapping.sources import LOG_TIME, PUBLISH_TIME
 from pipeline.suspicions import Suspicions
 
+_REPEATED: Final = 0.5
 TRUSTED = 'extract.trusted = ["time"]'
 
 
@@ -22,11 +25,11 @@ class MissionClock:
     """The clock to which sources are brought."""
 
     def __init__(self, clock: Clock, suspicions: Suspicions) -> None:
-        self.clock, self._suspicions = clock, suspicions
+        self.clock, self.suspicions = clock, suspicions
 
     def mended(self, subject: str, stamps: Stamps, judged: Judgement | None = None, setting: str = "") -> tuple[Int64s, Bools]:
         """The times [N] of a source on the mission's clock, and which rows [N] are to be kept."""
-        if not self._suspicions.looks_for("time"):
+        if not self.suspicions.looks_for("time"):
             return stamps.time_ns, np.ones(len(stamps), np.bool_)
         judgement = judged or judge(stamps)
         clock, mission_ns = judgement.clock, self.clock.ahead_ns(stamps.log_time_ns)
@@ -46,7 +49,7 @@ class MissionClock:
         if judgement.is_copy.any():
             done.append(f"the first time counts, {int(judgement.is_copy.sum())} positions of the others are left out")
         if seen:
-            self._suspicions.add("time", subject, seen="; ".join(seen), done=", ".join(done), setting=f"{setting}{TRUSTED}")
+            self.suspicions.add("time", subject, seen="; ".join(seen), done=", ".join(done), setting=f"{setting}{TRUSTED}")
         return np.where(is_good, time_ns, stamps.log_time_ns + mission_ns), ~judgement.is_copy
 
 
@@ -69,6 +72,14 @@ def on_one_clock(
     is_shared = bool(clocks) and all(clock.agrees_with(clocks[0]) for clock in clocks)
     mission = MissionClock(clocks[0] if is_shared and not clocks[0].is_log else Clock(), suspicions)
 
+    for found in parts.values():
+        for reader, rows in found:
+            clock = judged[id(reader)][1].clock if id(reader) in judged else None
+            is_other = clock is not None and not clock.agrees_with(mission.clock)
+            if is_other and _are_repeated(rows, [other for _, other in found if other is not rows]):
+                stamps, judgement = judged[id(reader)]
+                judged[id(reader)] = stamps, replace(judgement, clock=None)
+
     def mended(role: str, reader: ChannelReader, rows: Positions) -> Positions:
         if id(reader) not in judged:
             return rows
@@ -77,3 +88,13 @@ def on_one_clock(
         return rows.changed(time_ns=time_ns)[is_kept]
 
     return {role: [mended(role, *pair) for pair in found] for role, found in parts.items()}, mission
+
+
+def _are_repeated(rows: Positions, others: Sequence[Positions]) -> bool:
+    """Whether most of what a source says another one says of the same moment: then it comes late, and its clock is right."""
+    told = _said(rows)
+    return any(len(told & _said(other)) > _REPEATED * len(told) for other in others if len(other))
+
+
+def _said(rows: Positions) -> set[tuple[int, float, float]]:
+    return set(zip(rows.time_ns.tolist(), rows.first.tolist(), rows.second.tolist(), strict=True))

@@ -19,7 +19,7 @@ from pipeline.extract.height_units import heights_in_metres
 from pipeline.extract.hemispheres import check_hemispheres
 from pipeline.extract.joined import check_joined
 from pipeline.extract.mission_clock import on_one_clock
-from pipeline.extract.names import Naming, without_false_names
+from pipeline.extract.names import Naming, in_one_spelling, without_false_names
 from pipeline.extract.observers import from_observer
 from pipeline.extract.placement import Placing, bring_together, datum_of_transforms, in_enu, mission_frame, place
 from pipeline.extract.positions import Positions, Rows
@@ -130,6 +130,7 @@ def _identified(rows: Positions, readers: Sequence[ChannelReader], tolerance_s: 
         topical={reader.channel.topic for reader in of_detections if reader.names["agent"] is not None},
         stated={reader.channel.topic for reader in of_detections if reader.is_stated and reader.source.agent_path is not None},
     )
+    rows = in_one_spelling(rows)
     suggested = {reader.channel.topic: reader.channel.schema_name for reader in of_detections if not reader.is_stated}
     rows = without_false_names(rows, tolerance_s, naming, suspicions)
     rows = without_other_stages(rows, suggested, suspicions)

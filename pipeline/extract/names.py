@@ -31,6 +31,8 @@ _FURTHER: Final = 3.0
 _MIN_EXCHANGED_M: Final = 10.0
 _MAX_BEND_MPS2: Final = 10.0
 """One g: names that go from target to target bend by more, in three of ten messages."""
+_HEXADECIMAL: Final = re.compile(r"(?=.*[a-f])(?=.*[0-9])[0-9a-f]{6,}")
+"""Addresses of aircraft, and UUIDs."""
 _FILL_INS: Final = {"4294967295", "2147483647", "18446744073709551615", "9223372036854775807"}
 _CLASSES: Final = {
     "person", "persons", "people", "pedestrian", "human", "man", "woman", "child", "car", "vehicle", "truck", "bus", "van",
@@ -55,6 +57,19 @@ class Naming:
     believed: Collection[str]
     topical: Collection[str]
     stated: Collection[str] = ()
+
+
+def in_one_spelling(rows: Positions) -> Positions:
+    """The rows with names of hexadecimal digits, which one receiver writes in capitals or with hyphens and another does not."""
+    spelled: dict[str, str] = {}
+    changed: dict[str, str] = {}
+    for name in rows.agents.names:
+        plain = name.lower().replace("-", "")
+        if _HEXADECIMAL.fullmatch(plain) and spelled.setdefault(plain, name) != name:
+            changed[name] = spelled[plain]
+    if not changed:
+        return rows
+    return rows.changed(agent=np.array([changed.get(name, name) for name in rows.agent.tolist()], dtype=object))
 
 
 def without_false_names(rows: Positions, tolerance_s: float, naming: Naming, suspicions: Suspicions) -> Positions:

@@ -14,6 +14,7 @@ import numpy as np
 
 from pipeline.counted import told
 from pipeline.extract.clocks import Stamps
+from pipeline.extract.contested import check_links, check_static
 from pipeline.extract.field_reader import FieldReader
 from pipeline.extract.mission_clock import MissionClock
 from pipeline.extract.stamps import stamp_ns
@@ -60,6 +61,7 @@ class _Samples:
         times = np.array(self.times, dtype=np.int64)
         poses = np.array(self.poses, dtype=np.float64).reshape(-1, 7)
         if kind == "static" or (kind == "unmarked" and (poses == poses[0]).all()):
+            check_static(parent, child, poses, clock.suspicions)
             return Link(parent, child, times[-1:], poses[-1:, :3], poses[-1:, 3:], is_static=True)
         stamps = Stamps(times, np.array(self.log_times, dtype=np.int64), poses)
         times, is_kept = clock.mended(f"the transform {parent} → {child}", stamps)
@@ -192,6 +194,7 @@ def read_transforms(log: MissionLog, clock: MissionClock, counts: Counter[str], 
     for kind, found in samples.items():
         known = {link.child for link in links} if kind == "vehicle" else set()
         links += [each.link(parent, child, kind, clock) for (parent, child), each in found.items() if child not in known]
+    check_links(links, clock.suspicions)
     return tree_of(links)
 
 

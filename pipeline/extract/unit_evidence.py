@@ -187,7 +187,9 @@ def _of_far_metres(rows: Positions, radius_m: Float64s) -> Evidence | None:
 
 
 def _of_crawling(rows: Positions) -> Evidence | None:
-    """Degrees, or radians, in fields of metres: a smooth way that is too small."""
+    """Degrees, or radians, in fields of metres: a smooth way that is too small, of the target with most rows."""
+    number = rows.agents.number
+    rows = rows[number == np.bincount(number + 1).argmax() - 1]
     way_m, speed_mps = np.hypot(np.ptp(rows.first), np.ptp(rows.second)), _speed_mps(rows, 1.0) or 0.0
     largest = np.abs(rows.first).max(), np.abs(rows.second).max()
     if len(rows) < _MIN_ROWS or way_m >= _MAX_WAY_M or max(largest) > 180 or not _is_smooth(rows, way_m):

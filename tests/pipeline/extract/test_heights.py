@@ -57,6 +57,29 @@ def test_a_log_without_heights_is_as_it_was(tmp_path: Path) -> None:
     assert (tmp_path / "detections.parquet").read_bytes() == _as_written(tmp_path, is_height_used=False)
 
 
+@pytest.mark.parametrize("unknown", [-9999.0, 0.0, -32768.0])
+def test_heights_that_stand_for_none(tmp_path: Path, unknown: float) -> None:
+    rows = [fix(float(i), 48.0, 11.0 + 0.001 * i, altitude=unknown if i % 7 == 3 else 500.0 + i) for i in range(40)]
+    found = run(tmp_path, rows)
+    heights = found.detections["z_m"].to_pylist()
+    assert heights.count(None) == 6 and min(z for z in heights if z is not None) == 500.0
+    (told,) = of_heights(found)
+    assert told["seen"].startswith(f"6 of 40 altitudes are {unknown:g}")
+
+
+@pytest.mark.parametrize(
+    "height",
+    [
+        lambda i: 0.0 if i > 30 else 900.0 - 30.0 * i,  # it lands
+        lambda i: 999.0 if i == 20 else 979.0 + i,  # it passes there
+        lambda i: 0.0 if i < 20 else 400.0,  # seen once a minute
+    ],
+)
+def test_heights_that_only_look_like_none(tmp_path: Path, height: Any) -> None:
+    found = run(tmp_path, [fix(60.0 * i, 48.0, 11.0 + 0.01 * i, altitude=height(i)) for i in range(40)])
+    assert of_heights(found) == [] and found.detections["z_m"].to_pylist() == [height(i) for i in range(40)]
+
+
 def test_heights_can_be_left_alone(tmp_path: Path) -> None:
     found = run(tmp_path, climb(), is_height_used=False)
     assert found.detections.schema.equals(DETECTIONS) and found.detections["z_m"].to_pylist()[0] == 500.0

@@ -69,6 +69,17 @@ def test_names_in_fields_that_are_longer(tmp_path: Path, names: list[Any], calle
     assert set(agents(run(tmp_path, rows))) == called
 
 
+def test_an_address_in_capitals_is_the_same_address(tmp_path: Path) -> None:
+    uuid = "0A1B2C3D-0000-4000-8000-00000000000F"
+    spellings = [("4b16a0", "4B16A0"), (uuid, uuid.lower().replace("-", "")), ("fox", "FOX"), ("a1", "A1")]
+    rows = [
+        detection(i + 0.5 * j, 100.0 * number + 3.0 * i, 5.0, topic=f"/{'ab'[j]}/contacts", agent_id=names[j])
+        for i in range(10) for number, names in enumerate(spellings) for j in (0, 1)
+    ]  # fmt: skip
+    found = run(tmp_path, sorted(rows, key=lambda row: row.time_s))
+    assert agents(found) == {"4b16a0": 20, uuid: 20, "fox": 10, "FOX": 10, "a1": 10, "A1": 10} and kinds(found) == []
+
+
 def test_a_named_topic_of_arrays_is_a_sensors(tmp_path: Path) -> None:
     rows = [array("/detections/lidar_front", i, [(3.0 * i, y) for y in (0.0, 300.0, 600.0)]) for i in range(20)]
     found = run(tmp_path, rows)

@@ -47,6 +47,13 @@ def test_a_source_on_another_clock_is_shifted_to_the_logs(tmp_path: Path) -> Non
     assert suspected(found) == ["time /contacts/B: its stamps are shifted by +7200.05 s"]
 
 
+def test_a_second_receiver_that_says_the_same_later_is_late_and_not_on_another_clock(tmp_path: Path) -> None:
+    prompt = [dataclasses.replace(each, topic="/south/contacts/A") for each in contacts("A")]
+    late = [dataclasses.replace(each, topic="/north/contacts/A", time_s=each.time_s + 45.0) for each in prompt]
+    found = run(tmp_path, [*prompt, *late])
+    assert suspected(found) == [] and seconds(found) == [float(i) for i in range(30)]
+
+
 def test_truth_on_another_clock_is_shifted_too(tmp_path: Path) -> None:
     truth = [dataclasses.replace(each, topic="/truth/A") for each in contacts("A", 315_964_800.0, 60)]
     found = run(tmp_path, [*contacts("A"), *truth])

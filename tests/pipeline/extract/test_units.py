@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from fixtures.small_logs import Row, fix, stamp
+from fixtures.small_logs import Row, detection, fix, stamp
 from pyproj import Transformer
 from test_extract import fails, mk, run
 
@@ -218,6 +218,14 @@ def test_a_trusted_log_is_taken_as_it_stands(tmp_path: Path) -> None:
 def test_scaled_degrees_in_fields_of_metres(tmp_path: Path) -> None:
     way = np.column_stack([116_000_000 + 1300 * np.arange(40), np.full(40, 481_000_000)])
     fails(tmp_path, metric(way.astype(float)), InputError, "whole numbers, which may be 1e-7 degrees; left out")
+
+
+def test_degrees_of_several_ships_in_fields_of_metres_are_named(tmp_path: Path) -> None:
+    """x is the longitude, as libais writes it; two ships in turn are no smooth way."""
+    ways = [(4.0 + 7e-5 * i, 55.0, "1") if i % 2 else (4.0, 55.0 + 5e-5 * i, "2") for i in range(60)]
+    found = run(tmp_path, [detection(float(i), x, y, agent_id=name) for i, (x, y, name) in enumerate(ways)])
+    (told,) = found.summary["suspicions"]
+    assert "which may be degrees" in told["seen"]
 
 
 def test_radians_in_fields_of_metres_are_named(tmp_path: Path) -> None:
