@@ -61,7 +61,7 @@ class ChannelReader:
                 tuple(self._field(name, (text,)) for name, text in zip(names, texts, strict=True))
                 for texts in zip(*alternatives, strict=True)
             ]
-        self.more = MEASURED if self.is_polar else ()
+        self.more = MEASURED if self.is_polar else ORIGIN if paths.origin_latitude else ()
         fields = {name: self._field(name, getattr(paths, name)) for name in (*_OTHERS, *self.more)}
         self.fields = {name: reader for name, reader in fields.items() if reader.paths}
         self.conditions = Conditions(paths.where, source.where is not None)
@@ -150,6 +150,9 @@ class ChannelReader:
             np.column_stack([time_ns, log_time_ns, sequence, message[is_used]]).astype(np.int64).tobytes()
         )
         self.rows.floats.frombytes(np.column_stack([*numbers, self._covariances(columns, num_rows)]).tobytes())
+        if self.more:
+            more = [columns.get(name, absent) for name in self.more]
+            self._measured.frombytes(np.column_stack(more).astype(np.float64).tobytes())
         for kind, names in (("agent", self.rows.agents), ("sensor", self.rows.sensors)):
             stated = columns[kind].tolist() if kind in columns else [None] * num_rows
             names += mapped(stated, partial(self._identity, kind, place=()))
@@ -174,9 +177,9 @@ class ChannelReader:
             raise ConfigError(f"{where}: no message has {self.conditions.missing}; correct `where` in the [extract] entry")
 
     def measured(self) -> Mapping[str, Float64s]:
-        """Of all rows read [N] what messages state beside range, bearing and elevation (`MEASURED`), else NaN."""
-        columns = np.array(self._measured, dtype=np.float64).reshape(-1, len(MEASURED)).T
-        return dict(zip(MEASURED, columns, strict=True))
+        """Of all rows read [N] what messages state beside the position (`more`), else NaN."""
+        columns = np.array(self._measured, dtype=np.float64).reshape(-1, max(1, len(self.more))).T
+        return dict(zip(self.more, columns, strict=False))
 
     def finish(self) -> Positions:
         """All rows read; of ranges and bearings range, bearing and elevation are x, y and z (see `polar`)."""
@@ -198,7 +201,7 @@ class ChannelReader:
             return found[0] if found else None
         if self.alternatives == "all":
             return [point for points in found for point in points]
-        filled = {point[0]: point for points in reversed(found) for point in points if any(point[1:])}
+        filled = {point[0]: point for points in reversed(found) for point in points if _is_filled(point)}
         return [filled.get(point[0], point) for point in found[0]]
 
     def _joined(self, position: Sequence[FieldReader], message: Any) -> list[Point] | None:
@@ -271,6 +274,8 @@ MEASURED = (
     "range_rate", "range_sigma", "bearing_sigma", "elevation_sigma", "range_rate_sigma", "box_width", "box_height",
 )  # fmt: skip
 """What sources of ranges and bearings, or of pixels, may state beside these."""
+ORIGIN = ("origin_latitude", "origin_longitude")
+"""Where on the earth metres count from."""
 _NEEDED = ("x", "y", "latitude", "longitude", "pixel_x", "pixel_y")
 """Of a type, every one; of range and bearing one is enough: a direction finder has no ranges."""
 _OTHERS = ("covariance", "covariance_type", "sigma", "time", "frame_id", "agent", "sensor", "score")
@@ -293,6 +298,10 @@ def _number(value: Any) -> float:
         return float(value)
     except (TypeError, ValueError, OverflowError):
         return math.nan
+
+
+def _is_filled(point: Point) -> bool:
+    return any(point[1:]) and not any(math.isnan(_number(value)) for value in point[1:3])
 
 
 _NO_NAMES = {"", "-1", "none", "null", "nil", "nan", "n/a", "unknown", "unidentified", "undefined"}

@@ -21,6 +21,7 @@ from pipeline.extract.joined import check_joined
 from pipeline.extract.mission_clock import on_one_clock
 from pipeline.extract.names import Naming, in_one_spelling, without_false_names
 from pipeline.extract.observers import from_observer
+from pipeline.extract.origins import about_one_origin
 from pipeline.extract.placement import Placing, bring_together, datum_of_transforms, in_enu, mission_frame, place
 from pipeline.extract.positions import Positions, Rows
 from pipeline.extract.reuse import reused, without_reused_names
@@ -58,6 +59,7 @@ def rows_in_frame(
     detecting = [reader for reader in readers if reader.role == "detections"]
     detections, sightings = read_parts(detecting, read_cameras(log, detecting), counts, suspicions)
     parts = {"detections": detections, **parts} | ({SIGHTINGS: sightings} if sightings else {})
+    parts, origin = about_one_origin(parts)
     parts = without_set_back(parts, suspicions)
     if counts["steps_back"] and config.start is None and config.end is None:
         parts = without_set_back_unnumbered(parts, log, suspicions)
@@ -85,6 +87,8 @@ def rows_in_frame(
     _check_any(primary, rows[primary], counts, suspicions)
     rows = {role: in_enu(positions) for role, positions in rows.items()}
     datum = config.datum or datum_of_transforms(rows[primary], read_tree)
+    if datum is None and any(positions.is_geodetic.any() for positions in rows.values()):
+        datum = origin
     frame = mission_frame(rows[primary], [rows[role] for role in ROLES if role != primary], datum)
     rows = {role: _placed(role, found, frame, counts, transforms.apart) for role, found in rows.items()}
     before = set(rows["detections"].agents.names)

@@ -39,6 +39,7 @@ class MessageType:
     range, bearing, elevation, range_rate  what a sensor measured from where it was, and their standard deviations (..._sigma)
     range_sigma_m, bearing_sigma_deg, elevation_sigma_deg, range_rate_sigma_mps  where messages state none
     pixel_x, pixel_y, box_width, box_height  what a camera saw: right and down from the corner of its image, and how large
+    origin_latitude, origin_longitude  where on the earth x and y count from, where the type says so
     bearing_unit     of bearing, elevation and their standard deviations
     bearing_convention  what a bearing counts from
     observer         from whose poses was measured, by default; "{sensor}": those of the sensor that a message names
@@ -76,6 +77,8 @@ class MessageType:
     pixel_y: Paths = ()
     box_width: Paths = ()
     box_height: Paths = ()
+    origin_latitude: Paths = ()
+    origin_longitude: Paths = ()
     range_sigma_m: float | None = None
     bearing_sigma_deg: float | None = None
     elevation_sigma_deg: float | None = None

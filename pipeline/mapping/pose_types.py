@@ -36,6 +36,8 @@ POSES: Final[dict[str, MessageType]] = {
         schemas=("px4_msgs.VehicleLocalPosition", "px4_msgs.VehicleLocalPositionGroundtruth"),
         sigma=("eph",),
         where=("xy_valid",),
+        origin_latitude=("ref_lat",),
+        origin_longitude=("ref_lon",),
         frame_convention="ned",
     ),
     # The position was three fields before it was an array; its covariance an upper triangle before it was a diagonal.
@@ -88,7 +90,7 @@ POSES: Final[dict[str, MessageType]] = {
         is_suggested=False,
     ),
     "SceneUpdate": replace(
-        metric("foxglove.SceneUpdate", "entities[:].cubes[:].pose.position", "entities[:].spheres[:].pose.position"),
+        metric("foxglove.SceneUpdate", *(f"entities[:].{kind}[:].pose.position" for kind in ("cubes", "spheres", "models"))),
         alternatives="all",
         time=("entities[:].timestamp",),
         frame_id=("entities[:].frame_id",),

@@ -13,6 +13,7 @@ POSE_WORDS: Final = {
     "pose", "poses", "odom", "odometry", "fix", "gps", "gnss", "navsat", "location", "position", "tracker", "trackers",
     "sensor", "sensors", "ownship", "own", "ego", "platform", "platforms", "observer", "observers",
 }  # fmt: skip
+_SEEN: Final = {"contact", "contacts", "target", "targets", "track", "tracks"}
 _KNOWN: Final = TRUTH_WORDS | DETECTION_WORDS | POSE_WORDS | {"ground"}
 _STAGES: Final = {
     "raw", "filtered", "filter", "fused", "fusion", "merged", "combined", "tracked", "tracking", "object", "objects",
@@ -36,7 +37,8 @@ _SENSORS: Final = {
     "lidar", "laser", "camera", "cam", "rgb", "rgbd", "thermal", "infrared", "ir", "eo", "eoir", "sonar", "radar", "ars", "esr",
     "srr", "mrr", "lrr", "velodyne", "ouster", "livox", "realsense", "zed", "stereo", "mono", "depth", "front", "rear", "back",
     "left", "right", "center", "centre", "middle", "top", "bottom", "forward", "port", "starboard", "bow", "stern", "mast",
-    "flir", "lwir", "swir", "nir", "uv", "acoustic", "hydrophone", "ladar", "hesai", "robosense", "v2x",
+    "gps", "gnss", "rtk", "ublox", "novatel", "septentrio", "trimble", "ins", "receiver", "antenna", "transponder", "navpvt",
+    "bestpos", "flir", "lwir", "swir", "nir", "uv", "acoustic", "hydrophone", "ladar", "hesai", "robosense", "v2x",
 }  # fmt: skip
 """Words for who saw, or for where on a vehicle that is: the name of a sensor, wherever it stands."""
 
@@ -75,7 +77,10 @@ def pattern_of(topic: str, role: str, needs_agent: bool, topics: Sequence[str]) 
         return topic
     varying = _varying(parts, names, topics)
     if role == "detections":
-        word = max(i for i, known in enumerate(is_word) if known)
+        words = [i for i, known in enumerate(is_word) if known]
+        # /contacts/A7/pose: what stands behind the name only says what is told of it.
+        word = max((i for i in words if not _SEEN.isdisjoint(words_of(parts[i]))), default=words[-1])
+        word = words[-1] if any(not DETECTION_WORDS.isdisjoint(words_of(parts[i])) for i in words if i > word) else word
         sensors = [i for i in names if i < word or _is_sensor(parts[i])]
         agents = [i for i in names if i not in sensors] if needs_agent else []
         for placeholder, places in (("sensor", sensors), ("agent", agents)):

@@ -1,6 +1,7 @@
 """Every known type against messages built with the real definitions of their types, through the log, in every encoding."""
 
 import json
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -140,6 +141,15 @@ def test_detection_array_whose_header_only_its_items_fill_in(tmp_path: Path) -> 
     np.testing.assert_array_equal(rows.score, [0.5, np.nan])
 
 
+def test_a_box_that_is_not_a_number_is_not_filled_in(tmp_path: Path) -> None:
+    found = HUMBLE.detection("7", 1.0)
+    found.bbox.center.position.x = math.nan
+    rows, _ = read(
+        tmp_path, [HUMBLE.cdr_row(HUMBLE("vision_msgs/msg/Detection3DArray", header=HUMBLE.header(), detections=[found]))]
+    )
+    assert rows.first.tolist() == [2.0]  # of the hypothesis
+
+
 def test_detections_from_several_sensors_keep_their_own_stamps_and_frames(tmp_path: Path) -> None:
     one, other = HUMBLE.detection("a", 1.0), HUMBLE.detection("b", 2.0)
     one.header, other.header = HUMBLE.header("cam", START_NS + 1), HUMBLE.header("lidar", START_NS + 2)
@@ -192,7 +202,7 @@ def test_adsb_vehicles(tmp_path: Path, encoding: str) -> None:
 def scene() -> SceneUpdate:
     message = SceneUpdate()
     message.deletions.add()
-    for name, num_cubes, num_spheres in (("a", 2, 0), ("b", 0, 0), ("c", 1, 1)):
+    for name, num_cubes, num_spheres in (("a", 2, 0), ("b", 0, 0), ("c", 1, 1), ("d", 0, 0)):
         entity = message.entities.add(id=name, frame_id="lidar")
         entity.timestamp.FromNanoseconds(START_NS + 5)
         for i in range(num_cubes):
@@ -200,15 +210,17 @@ def scene() -> SceneUpdate:
             cube.x, cube.y, cube.z = 1.0 + i, 2.0, 3.0
         for _ in range(num_spheres):
             entity.spheres.add().pose.position.x = 50.0
+        if name == "d":
+            entity.models.add().pose.position.x = 60.0
     return message
 
 
 @pytest.mark.parametrize("encode", [protobuf_row, json_row])
-def test_cubes_and_spheres_of_a_scene(tmp_path: Path, encode: Callable[[Message], Row]) -> None:
+def test_cubes_spheres_and_models_of_a_scene(tmp_path: Path, encode: Callable[[Message], Row]) -> None:
     rows, reader = read(tmp_path, [encode(scene())])
-    assert rows.first.tolist() == [1.0, 2.0, 1.0, 50.0] and rows.agent.tolist() == ["a", "a", "c", "c"]
-    assert rows.second.tolist() == [2.0, 2.0, 2.0, 0.0] and set(rows.frame_id) == {"lidar"}
-    assert rows.time_ns.tolist() == [START_NS + 5] * 4 and reader.counts["incomplete"] == 0
+    assert rows.first.tolist() == [1.0, 2.0, 1.0, 50.0, 60.0] and rows.agent.tolist() == ["a", "a", "c", "c", "d"]
+    assert rows.second.tolist() == [2.0, 2.0, 2.0, 0.0, 0.0] and set(rows.frame_id) == {"lidar"}
+    assert rows.time_ns.tolist() == [START_NS + 5] * 5 and reader.counts["incomplete"] == 0
 
 
 def test_fix_without_position_or_covariance(tmp_path: Path) -> None:

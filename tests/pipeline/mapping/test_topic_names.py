@@ -14,6 +14,11 @@ def test_words() -> None:
     [
         ("/contacts/A7", "/contacts/{agent}"),
         ("/contacts/2", "/contacts/{agent}"),
+        ("/contacts/A7/pose", "/contacts/{agent}/pose"),
+        ("/boat/targets/A7/gps/fix", "/{sensor}/targets/{agent}/gps/fix"),
+        ("/target/gps1/raw", "/target/{sensor}/raw"),
+        ("/tracks/uav1/detections", "/tracks/{sensor}/detections"),
+        ("/radar/north/position", "/radar/{sensor}/position"),
         ("/contacts/filtered/A7", "/contacts/filtered/{agent}"),
         ("/camera1/contacts/A7", "/{sensor}/contacts/{agent}"),
         ("/detections/raw", "/detections/raw"),
