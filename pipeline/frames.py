@@ -10,6 +10,7 @@ the meridians, about (longitude difference) · sin(latitude): 0.5° at 50 km and
 """
 
 import functools
+import re
 
 import numpy as np
 from pyproj import Transformer
@@ -22,6 +23,10 @@ GEOREFERENCED_FRAME_ID = "mission"
 DEFAULT_FRAME_ID = "map"
 EARTH_CENTRED = frozenset({"earth", "ecef"})
 """Frames that REP 105 and receivers have at the centre of the earth: their x and y are no plane."""
+_FIXED_WORDS = frozenset({
+    "map", "odom", "world", "mission", "enu", "ned", "local", "origin", "fixed", "global", "utm", "earth", "ecef", "wgs84",
+    "vicon", "mocap", "optitrack", "qualisys",
+})  # fmt: skip
 DEGREE_M = 111_195.0
 """Of latitude, on a sphere: for what need not be exact."""
 DATUM_DECIMALS = 4
@@ -42,6 +47,16 @@ def georeferenced_frame(latitude_deg: Float64s, longitude_deg: Float64s, datum: 
     longitude = (float(longitude_deg[0] + np.median(offset)) + 180.0) % 360.0 - 180.0
     latitude = round(float(np.median(latitude_deg)), DATUM_DECIMALS)
     return Frame(GEOREFERENCED_FRAME_ID, latitude, round(longitude, DATUM_DECIMALS))
+
+
+def words_of_frame(name: str) -> set[str]:
+    """The words of a frame's name, in small letters."""
+    return set(re.split(r"[^a-z0-9]+", name.lower()))
+
+
+def stands_still(name: str) -> bool:
+    """Whether a frame is one that stands still, by the words of its name."""
+    return not _FIXED_WORDS.isdisjoint(words_of_frame(name))
 
 
 def to_local(frame: Frame, latitude_deg: Float64s, longitude_deg: Float64s) -> tuple[Float64s, Float64s]:

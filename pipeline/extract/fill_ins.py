@@ -9,7 +9,7 @@ import numpy as np
 from cadence.arrays import Bools
 from pipeline.counted import counted
 from pipeline.extract.positions import Positions
-from pipeline.frames import DEGREE_M
+from pipeline.frames import DEGREE_M, stands_still
 from pipeline.suspicions import Suspicions
 
 _FILL_INS: Final = ((0, 0), (-1, -1), (90, 180), (-90, -180), (180, 180), (999, 999), (9999, 9999), (99999, 99999))
@@ -21,6 +21,8 @@ _MIN_APART_M: Final = 10.0
 _MIN_JUMP_MPS: Final = 10.0
 _MIN_TIMES: Final = 3
 _MAX_SHARE: Final = 0.3
+_MAX_OWN_SHARE: Final = 0.95
+"""Of messages with something at the sensor itself, which none of its targets can be at."""
 _FAR: Final = 0.1
 """Of several targets without names one may stand at 0, 0, but then it is seen there for long, or others pass."""
 _MIN_HELD: Final = 5
@@ -44,11 +46,7 @@ def without_fill_ins(rows: Positions, role: str, suspicions: Suspicions) -> Posi
                 is_fill_in |= is_value & of_agent
             elif not is_alone and _jumps(rows[of_agent], is_value[of_agent]):
                 is_fill_in |= is_value & of_agent
-            elif (
-                (first, second) in _FILL_INS
-                and rows.agents.number[of_agent][0] < 0
-                and _flickers(rows[of_agent], is_value[of_agent])
-            ):
+            elif (first, second) in _FILL_INS and _are_none(rows[of_agent], is_value[of_agent], len(rows)):
                 is_fill_in |= is_value & of_agent
     if not is_fill_in.any():
         return rows
@@ -102,13 +100,18 @@ def _by_agent(rows: Positions, is_value: Bools) -> Iterator[Bools]:
         yield rows.agents.number == number
 
 
+def _are_none(rows: Positions, is_value: Bools, num_rows: int) -> bool:
+    """Whether rows of one name, or without any, of a reader that has `num_rows` are no targets where they are at a place."""
+    if is_value.sum() == num_rows:
+        return False
+    checks = (_fill_lists, _flickers, _at_sensor) if rows.agents.number[0] < 0 else (_fill_lists,)
+    return any(check(rows, is_value) for check in checks)
+
+
 def _flickers(rows: Positions, is_value: Bools) -> bool:
     """Whether rows without a name are at one place now and then, and no others of theirs come near it."""
-    messages, message = np.unique(rows.message, return_inverse=True)
-    is_there = np.zeros(len(messages), np.bool_)
-    is_there[message[is_value]] = True
-    times = int((np.diff(is_there.astype(np.int8), prepend=0) == 1).sum())
-    if times < _MIN_TIMES or is_there.mean() > _MAX_SHARE or is_value.all():
+    times, share = _comings(rows, is_value)
+    if times < _MIN_TIMES or share > _MAX_SHARE or is_value.all():
         return False
     unit_m = DEGREE_M if rows.is_geodetic[0] else 1.0
     place, others = (np.column_stack([rows.first, rows.second])[mask] for mask in (is_value, ~is_value))
@@ -117,6 +120,33 @@ def _flickers(rows: Positions, is_value: Bools) -> bool:
         return False
     least_m = unit_m * float(np.hypot(*(others - place[0]).T).min())
     return least_m > max(_MIN_APART_M, _FAR * unit_m * float(np.hypot(*np.ptp(others, axis=0))))
+
+
+def _at_sensor(rows: Positions, is_value: Bools) -> bool:
+    """Whether rows without a name are to the last digit, now and then, where the sensor is in whose frame they are.
+
+    So write cameras that found no depth, and radars with empty places in their lists.
+    """
+    zeros = rows[is_value]
+    is_zero = not (np.any(zeros.first) or np.any(zeros.second) or np.any(np.nan_to_num(zeros.z_m)))
+    if not is_zero or rows.is_geodetic[0] or any(not name or stands_still(name) for name in zeros.frames.names):
+        return False
+    times, share = _comings(rows, is_value)
+    return times >= _MIN_TIMES and share < _MAX_OWN_SHARE
+
+
+def _fill_lists(rows: Positions, is_value: Bools) -> bool:
+    """Whether messages have several rows of a name, or without one, at a place: lists of a fixed length that are not full."""
+    _, num = np.unique(rows.message[is_value], return_counts=True)
+    return len(num) >= _MIN_TIMES and bool(np.median(num) > 1)
+
+
+def _comings(rows: Positions, is_value: Bools) -> tuple[int, float]:
+    """How often rows of a place come up, and the share of the messages that hold some."""
+    messages, message = np.unique(rows.message, return_inverse=True)
+    is_there = np.zeros(len(messages), np.bool_)
+    is_there[message[is_value]] = True
+    return int((np.diff(is_there.astype(np.int8), prepend=0) == 1).sum()), float(is_there.mean())
 
 
 def _jumps(rows: Positions, is_value: Bools) -> bool:

@@ -1,5 +1,6 @@
 """Heights in metres: what is in feet or flight levels, by what the source states or by what the numbers can be."""
 
+from collections import Counter
 from typing import Final
 
 import numpy as np
@@ -25,9 +26,11 @@ _MAX_HEIGHT_M: Final = 20_000.0
 """Higher than any aircraft in metres; in feet it is six kilometres."""
 
 
-def heights_in_metres(source: SourceConfig, role: str, rows: Positions, suspicions: Suspicions) -> Positions:
+def heights_in_metres(
+    source: SourceConfig, role: str, rows: Positions, counts: Counter[str], suspicions: Suspicions
+) -> Positions:
     """The rows of one reader with heights in metres; those that can be none are left out, of the heights alone."""
-    rows = _without_fill_ins(rows, role, suspicions)
+    rows = _without_fill_ins(rows, role, counts, suspicions)
     if source.height_unit is not None:
         return rows.changed(z_m=rows.z_m * _TO_METRES[source.height_unit])
     height = rows.z_m[np.isfinite(rows.z_m) & (rows.z_m != 0)]
@@ -53,12 +56,16 @@ def _are_feet(height: Float64s) -> bool:
     return bool((height % _FEET == 0).all() and len(np.unique(height)) >= _MIN_VALUES and height.max() > _MIN_FEET)
 
 
-def _without_fill_ins(rows: Positions, role: str, suspicions: Suspicions) -> Positions:
-    """The rows without the heights that stand for none: some of the known values, from which nothing gets to the others."""
+def _without_fill_ins(rows: Positions, role: str, counts: Counter[str], suspicions: Suspicions) -> Positions:
+    """The rows without the heights that stand for none: some of the known values, from which nothing gets to the others.
+
+    A transponder states no altitude on the ground, of which decoders make zero: where a track begins or ends that is counted,
+    and no suspicion.
+    """
     is_known = np.isin(rows.z_m, _FILL_INS)
     if not is_known.any() or not suspicions.looks_for("place"):
         return rows
-    is_fill_in = np.zeros(len(rows), np.bool_)
+    is_fill_in, is_grounded = np.zeros(len(rows), np.bool_), np.zeros(len(rows), np.bool_)
     for number in np.unique(rows.agents.number[is_known]).tolist():
         track = np.flatnonzero((rows.agents.number == number) & np.isfinite(rows.z_m))
         track = track[np.argsort(rows.time_ns[track], kind="stable")]
@@ -66,16 +73,19 @@ def _without_fill_ins(rows: Positions, role: str, suspicions: Suspicions) -> Pos
             is_value = rows.z_m[track] == value
             time_s = (rows.time_ns[track] - rows.time_ns[track[0]]) * 1e-9
             if not is_value.all() and _jumps(rows.z_m[track], time_s, is_value):
-                is_fill_in[track[is_value]] = True
-    if not is_fill_in.any():
-        return rows
-    values = " and ".join(f"{value:g}" for value in np.unique(rows.z_m[is_fill_in]).tolist())
-    number = counted(int(is_fill_in.sum()), f"of {len(rows)} altitudes is", f"of {len(rows)} altitudes are")
-    suspicions.add(
-        "place", str(rows.topic[0]), seen=f"{number} {values}, from where nothing gets to the others",
-        done="these altitudes are left out", setting=f'altitude or z in its [[extract.{role}]], or extract.trusted = ["place"]',
-    )  # fmt: skip
-    return rows.changed(z_m=np.where(is_fill_in, np.nan, rows.z_m))
+                is_fault = value != 0 or bool(np.diff(np.flatnonzero(~is_value)).max(initial=1) > 1)
+                (is_fill_in if is_fault else is_grounded)[track[is_value]] = True
+    counts["ground_heights"] += int(is_grounded.sum())
+    if is_fill_in.any():
+        values = " and ".join(f"{value:g}" for value in np.unique(rows.z_m[is_fill_in]).tolist())
+        number = counted(int(is_fill_in.sum()), f"of {len(rows)} altitudes is", f"of {len(rows)} altitudes are")
+        suspicions.add(
+            "place", str(rows.topic[0]), seen=f"{number} {values}, from where nothing gets to the others",
+            done="these altitudes are left out",
+            setting=f'altitude or z in its [[extract.{role}]], or extract.trusted = ["place"]',
+        )  # fmt: skip
+    is_none = is_fill_in | is_grounded
+    return rows.changed(z_m=np.where(is_none, np.nan, rows.z_m)) if is_none.any() else rows
 
 
 def _jumps(height: Float64s, time_s: Float64s, is_value: Bools) -> bool:

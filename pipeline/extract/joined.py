@@ -11,16 +11,11 @@ from pipeline.counted import told
 from pipeline.extract.positions import Positions
 from pipeline.extract.transform_messages import LogTransforms
 from pipeline.extract.transforms import TransformTree
-from pipeline.frames import DEGREE_M
+from pipeline.frames import DEGREE_M, stands_still
 from pipeline.logs.parts import missing_parts, recorded_parts
 from pipeline.logs.reader import MissionLog
 from pipeline.suspicions import Suspicions
 
-_FIXED_WORDS: Final = {
-    "map", "odom", "world", "mission", "enu", "ned", "local", "origin", "fixed", "global", "utm", "earth", "ecef", "wgs84",
-    "vicon", "mocap", "optitrack", "qualisys",
-}  # fmt: skip
-"""Words in the names of frames that stand still, by convention."""
 _BODIES: Final = {"base_link", "base_footprint", "base", "body", "chassis", "vehicle"}
 """Frames that move with a vehicle, by REP 105 and custom."""
 _NUMBERED: Final = re.compile(r"(.+)_(\d+)(\.mcap.*)")
@@ -40,7 +35,7 @@ def check_joined(
     frame beside a sensor that moves in another. Messages of the topics `framed` have a field for the frame; where it is empty
     and something moves, that is told as well.
     """
-    names = sorted({name for name in _metric_frames(rows[role]) if name and not _stands_still(name)})
+    names = sorted({name for name in _metric_frames(rows[role]) if name and not stands_still(name)})
     unnamed = _without_frame(rows[role], framed)
     if not (names or unnamed) or not suspicions.looks_for("place"):
         return
@@ -51,7 +46,7 @@ def check_joined(
             setting='extract.frame = "map" (they are), or let the messages say whose coordinates they are',
         )  # fmt: skip
     worlds = {name: tree.world(name) for name in (*tree.links, *(link.parent for link in tree.links.values()))}
-    are_still = {world for world in worlds.values() if _stands_still(world)}
+    are_still = {world for world in worlds.values() if stands_still(world)}
     apart = [name for name in names if name not in worlds or (are_still and worlds[name] not in are_still)]
     if apart and (tree.links or tree.problems or transforms.counts):
         known = "; ".join(_links(tree)) or "none that can be used"
@@ -107,10 +102,6 @@ def _mover(poses: Positions, names: Collection[str]) -> str:
         if way_m > _MIN_MOVED_M and _metric_frames(found).isdisjoint(names):
             return f"{topic} moves by {way_m:.4g} m"
     return ""
-
-
-def _stands_still(name: str) -> bool:
-    return not _FIXED_WORDS.isdisjoint(re.split(r"[^a-z0-9]+", name.lower()))
 
 
 def _links(tree: TransformTree) -> list[str]:

@@ -67,7 +67,7 @@ def rows_in_frame(
     timed, clock = on_one_clock(parts, suspicions)
     limits = Limits(config.max_extrapolation_s, config.max_transform_gap_s)
     timed = _from_observers(parts, timed, limits, counts, suspicions)
-    placed = {role: _in_place(role, parts[role], timed[role], suspicions) for role in ROLES}
+    placed = {role: _in_place(role, parts[role], timed[role], counts, suspicions) for role in ROLES}
     check_hemispheres(placed, config.datum, suspicions)
     rows = {role: _columns([each for _, each in placed[role]], counts) for role in ROLES}
     if sightings:
@@ -114,7 +114,7 @@ def _from_observers(
     if SIGHTINGS in parts:
         found[SIGHTINGS] = [in_pairs(rows) for rows in timed[SIGHTINGS]]
     if any(reader.has_observer for role in measuring for reader, _ in parts[role]):
-        about = [each for _, each in _in_place("poses", parts["poses"], timed["poses"], suspicions)]
+        about = [each for _, each in _in_place("poses", parts["poses"], timed["poses"], Counter(), suspicions)]
         poses = Positions.concatenate(about or [Rows().finish()])
         for role in measuring:
             found[role] = [
@@ -164,13 +164,14 @@ def _numbered(parts: Sequence[tuple[ChannelReader, Positions]]) -> list[tuple[Ch
 
 
 def _in_place(
-    role: str, parts: Sequence[tuple[ChannelReader, Positions]], timed: Sequence[Positions], suspicions: Suspicions
-) -> list[tuple[ChannelReader, Positions]]:
+    role: str, parts: Sequence[tuple[ChannelReader, Positions]], timed: Sequence[Positions], counts: Counter[str],
+    suspicions: Suspicions,
+) -> list[tuple[ChannelReader, Positions]]:  # fmt: skip
     """The rows of each reader, whose times are mended, in true units and without fill-ins."""
     found = [
         (reader, in_true_units(reader.source, role, rows, suspicions)) for (reader, _), rows in zip(parts, timed, strict=True)
     ]
-    found = [(reader, heights_in_metres(reader.source, role, rows, suspicions)) for reader, rows in found]
+    found = [(reader, heights_in_metres(reader.source, role, rows, counts, suspicions)) for reader, rows in found]
     found = [(reader, without_held(without_fill_ins(rows, role, suspicions), role, suspicions)) for reader, rows in found]
     filled = [(reader, without_frozen(rows, role, suspicions)) for reader, rows in found]
     for _, rows in filled:

@@ -99,7 +99,7 @@ def write_tables(log: MissionLog, folder: Path, config: ExtractConfig, progress:
         refused = "; ".join(few(suspicions.lines()))
         raise ImplausibleInputError(f"{log.path}: refused by --strict, as something in it is suspected: {refused}")
     summary = summarise(log, readers, detections.positions, truth, poses, frame, counts, suspicions, len(obstacles))
-    told |= {"static": counts["static"]} if counts["static"] else {}
+    told |= {name: counts[name] for name in ("static", "ground_heights") if counts[name]}
     told |= {"accuracy": records, "unused": unused, "transforms": transforms.summary(counts)}
     told |= {"taken": taken} if taken else {}
     return summary | told | ({"height": dict(heights.record)} if heights.record else {})

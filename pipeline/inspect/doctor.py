@@ -36,6 +36,8 @@ _LEFT_OUT = {
     "dropped_nonfinite": "positions are NaN, infinite or off the earth",
     "spikes": "positions lie far off their track",
     "other_frame": "positions are in another frame that no transform joins",
+    "ground_heights": "altitudes are 0 where a track begins or ends, as on the ground",
+    "static": "returns stand, by the Doppler of their scans",
     "bad_covariance": "covariances are not positive definite",
 }
 _ADVICE = {
@@ -204,7 +206,7 @@ def _use_lines(diagnosis: Diagnosis) -> list[str]:
             counts.append(f"{counted(use[name], 'position')} of {whose}{_topics(use, role)}")
     if words := measurement_words(use.get("measurements", {})):
         counts.append(words)
-    counts += [f"left out: {told(use[name], words)}" for name, words in _LEFT_OUT.items() if use[name]]
+    counts += [f"left out: {told(use[name], words)}" for name, words in _LEFT_OUT.items() if use.get(name)]
     return counts + [f"not used, though it may hold detections: {channel}: {why}" for channel, why in use["unused"].items()]
 
 

@@ -71,6 +71,30 @@ def test_zeros_in_lists_without_names(
     assert len(found.summary["suspicions"]) == (num == 0)
 
 
+@pytest.mark.parametrize(
+    ("num", "frame", "names"),
+    [
+        (lambda i: i % 3 == 0 or i % 5 == 0, "oak_link", None),  # a camera that found no depth in half of its messages
+        (lambda i: 3 - i % 2, "map", None),  # a list of five places
+        (lambda i: 3 - i % 2, "map", "0"),
+    ],
+)
+def test_zeros_that_a_sensor_writes_for_none(tmp_path: Path, num: Callable[[int], int], frame: str, names: str | None) -> None:
+    rows = []
+    for i in range(60):
+        places = [(8.0 + 0.1 * i, 2.0), (9.0, -3.0 + 0.1 * i), *([(0.0, 0.0)] * num(i))]
+        rows += [array("/detections", i, places, None if names is None else ["1", "2", *([names] * num(i))])]
+        rows[-1].message["header"]["frame_id"] = frame  # type: ignore[index, call-overload]
+    found = run(tmp_path, rows)
+    assert found.summary["num_detections"] == 120 and len(found.summary["suspicions"]) == 1
+    assert found.summary["num_agents"] == (0 if names is None else 2)
+
+
+def test_a_target_that_stands_at_the_zero_of_the_world(tmp_path: Path) -> None:
+    found = run(tmp_path, [array("/detections", i, [(8.0 + 0.1 * i, 2.0), *([(0.0, 0.0)] * (i % 3 > 0))]) for i in range(60)])
+    assert found.summary["num_detections"] == 100 and found.summary["suspicions"] == []
+
+
 @pytest.mark.parametrize("held", [5, 30])
 def test_a_receiver_that_begins_at_the_place_of_its_maker(tmp_path: Path, held: int) -> None:
     found = run(tmp_path, [*(fix(float(i), 31.2304, 121.4737) for i in range(held)), *drive(60, held)])

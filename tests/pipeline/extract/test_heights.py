@@ -80,6 +80,14 @@ def test_heights_that_only_look_like_none(tmp_path: Path, height: Any) -> None:
     assert of_heights(found) == [] and found.detections["z_m"].to_pylist() == [height(i) for i in range(40)]
 
 
+def test_zeros_where_a_track_begins_or_ends_are_the_ground(tmp_path: Path) -> None:
+    """Transponders state no altitude there, and decoders make zero of it: no heights, and nothing that cannot be meant."""
+    heights = [0.0] * 5 + [533.0 + i for i in range(30)] + [0.0] * 5
+    found = run(tmp_path, [fix(5.0 * i, 67.8, 20.3 + 0.001 * i, altitude=z) for i, z in enumerate(heights)])
+    assert of_heights(found) == [] and found.summary["ground_heights"] == 10
+    assert found.detections["z_m"].to_pylist() == [None] * 5 + heights[5:35] + [None] * 5
+
+
 def test_heights_can_be_left_alone(tmp_path: Path) -> None:
     found = run(tmp_path, climb(), is_height_used=False)
     assert found.detections.schema.equals(DETECTIONS) and found.detections["z_m"].to_pylist()[0] == 500.0
