@@ -61,7 +61,7 @@ class ChannelReader:
                 tuple(self._field(name, (text,)) for name, text in zip(names, texts, strict=True))
                 for texts in zip(*alternatives, strict=True)
             ]
-        self.more = MEASURED if self.is_polar else ORIGIN if paths.origin_latitude else ()
+        self.more = MEASURED if self.is_polar else ORIGIN if paths.origin_latitude else AXES if paths.axes else ()
         fields = {name: self._field(name, getattr(paths, name)) for name in (*_OTHERS, *self.more)}
         self.fields = {name: reader for name, reader in fields.items() if reader.paths}
         self.conditions = Conditions(paths.where, source.where is not None)
@@ -276,6 +276,8 @@ MEASURED = (
 """What sources of ranges and bearings, or of pixels, may state beside these."""
 ORIGIN = ("origin_latitude", "origin_longitude")
 """Where on the earth metres count from."""
+AXES = ("axes",)
+"""Whether x, y and z are along the axes that the type has by convention."""
 _NEEDED = ("x", "y", "latitude", "longitude", "pixel_x", "pixel_y")
 """Of a type, every one; of range and bearing one is enough: a direction finder has no ranges."""
 _OTHERS = ("covariance", "covariance_type", "sigma", "time", "frame_id", "agent", "sensor", "score")

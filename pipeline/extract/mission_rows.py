@@ -22,6 +22,7 @@ from pipeline.extract.mission_clock import on_one_clock
 from pipeline.extract.names import Naming, in_one_spelling, without_false_names
 from pipeline.extract.observers import from_observer
 from pipeline.extract.origins import about_one_origin
+from pipeline.extract.own_zeros import check_far_zeros, check_own_zeros
 from pipeline.extract.placement import Placing, bring_together, datum_of_transforms, in_enu, mission_frame, place
 from pipeline.extract.positions import Positions, Rows
 from pipeline.extract.reuse import reused, without_reused_names
@@ -59,6 +60,7 @@ def rows_in_frame(
     detecting = [reader for reader in readers if reader.role == "detections"]
     detections, sightings = read_parts(detecting, read_cameras(log, detecting), counts, suspicions)
     parts = {"detections": detections, **parts} | ({SIGHTINGS: sightings} if sightings else {})
+    check_own_zeros(parts, suspicions)
     parts, origin = about_one_origin(parts)
     parts = without_set_back(parts, suspicions)
     if counts["steps_back"] and config.start is None and config.end is None:
@@ -85,7 +87,9 @@ def rows_in_frame(
         check_joined(rows, primary, transforms, read_tree, log, suspicions, framed)
     rows = bring_together(rows, primary, placing, read_tree, counts)
     _check_any(primary, rows[primary], counts, suspicions)
-    rows = {role: in_enu(positions) for role, positions in rows.items()}
+    are_enu = {reader.channel.topic for reader in readers if reader.source.frame_convention == "enu"}
+    rows = {role: in_enu(positions, are_enu, counts) for role, positions in rows.items()}
+    check_far_zeros(rows["detections"], suspicions)
     datum = config.datum or datum_of_transforms(rows[primary], read_tree)
     if datum is None and any(positions.is_geodetic.any() for positions in rows.values()):
         datum = origin

@@ -1,7 +1,7 @@
 """Positions as read (metres in some frame, or degrees) → metres in one mission frame, east and north."""
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,7 +10,15 @@ from cadence.errors import ConfigError, InputError
 from pipeline.extract.covariances import rotated
 from pipeline.extract.positions import Positions
 from pipeline.extract.transforms import Limits, TransformTree, is_of_earth
-from pipeline.frames import DEFAULT_FRAME_ID, EARTH_CENTRED, east_north_up, from_earth_centred, georeferenced_frame, to_local
+from pipeline.frames import (
+    DEFAULT_FRAME_ID,
+    EARTH_CENTRED,
+    east_north_up,
+    from_earth_centred,
+    georeferenced_frame,
+    to_local,
+    words_of_frame,
+)
 from pipeline.tables import Frame
 
 FIXED_FRAMES = {"map", "odom", "world", "mission", "enu", "local", "local_origin", "fixed"}
@@ -143,9 +151,18 @@ def place(positions: Positions, frame: Frame) -> tuple[Positions, int]:
     return placed.changed(first=first, second=second, is_geodetic=np.zeros_like(rows)), num_elsewhere
 
 
-def in_enu(positions: Positions) -> Positions:
-    """The rows with x east, y north and z up; their frame, if it has a name, gets another one."""
+def in_enu(positions: Positions, are_enu: Collection[str], counts: Counter[str]) -> Positions:
+    """The rows with x east, y north and z up; their frame, if it has a name, gets another one.
+
+    What is in a frame that is north, east, down by its name is so, but for the topics `are_enu`.
+    """
     rows = positions.is_ned & ~positions.is_geodetic
+    are_ned = np.array(["ned" in words_of_frame(name) for name in positions.frames.names], np.bool_)
+    if are_ned.any():
+        is_open = np.array([topic not in are_enu for topic in positions.topics.names])[positions.topics.number]
+        is_named = are_ned[positions.frames.number] & (positions.frames.number >= 0) & is_open & ~rows & ~positions.is_geodetic
+        counts["north_by_name"] += int(is_named.sum()) // positions.PLACES
+        rows |= is_named
     if not rows.any():
         return positions
     turned = _turned(positions, rows, np.broadcast_to(_NED_TO_ENU, (int(rows.sum()), 3, 3)), np.zeros(3))

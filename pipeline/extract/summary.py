@@ -35,6 +35,7 @@ def tell(counts: Counter[str], suspicions: Suspicions, detections: Positions, lo
         "spikes": "positions lie far off their track (see extract.max_speed_mps) and were skipped",
         "other_frame": "positions are in another frame than the detections, which no transform joins, and were skipped",
         "no_transform": "positions have no transform near enough in time (see extract.max_extrapolation_s) and were skipped",
+        "north_by_name": "positions are north, east, down by their frame's name and were turned (see frame_convention)",
         "ground_heights": "altitudes are 0 where a track begins or ends, as on the ground, and were left out",
         "static": "returns stand, by the Doppler of their scans, and were left out (see is_static_used of a source)",
         "no_observer": "measurements have no pose of their observer near enough in time and were skipped",

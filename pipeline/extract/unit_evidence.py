@@ -102,7 +102,7 @@ def of_metres(rows: Positions) -> Evidence | None:
         seen = f"positions {np.median(radius_m) / 1e3:.0f} km from zero, as from the centre of the earth to its surface"
         return Evidence(seen, "ecef", "read as earth-centred", 'unit = "ecef" or "m"')
     named = rows.frame_id[are_earth_centred(rows)]
-    if len(named):
+    if len(named) and np.any(radius_m):  # zeros alone are what stands for none
         seen = f"frame {named[0]}, the earth's centre by its name, but positions {np.median(radius_m):.4g} m from zero"
         return Evidence(seen, "as they are", "used as metres of a plane", 'unit = "m"')
     return _of_far_metres(rows, radius_m) or _of_crawling(rows)

@@ -91,15 +91,11 @@ def write_tables(log: MissionLog, folder: Path, config: ExtractConfig, progress:
     if words := measurement_words(told.get("measurements", {})):
         progress.note(f"extract: {words}")
     transforms.tell()
-    if frame.frame_id.lower().endswith("ned"):
-        progress.note(
-            f'extract: frame {frame.frame_id} may be north-east-down; if so give its sources frame_convention = "ned"'
-        )
     if config.is_strict and suspicions:
         refused = "; ".join(few(suspicions.lines()))
         raise ImplausibleInputError(f"{log.path}: refused by --strict, as something in it is suspected: {refused}")
     summary = summarise(log, readers, detections.positions, truth, poses, frame, counts, suspicions, len(obstacles))
-    told |= {name: counts[name] for name in ("static", "ground_heights") if counts[name]}
+    told |= {name: counts[name] for name in ("static", "ground_heights", "north_by_name") if counts[name]}
     told |= {"accuracy": records, "unused": unused, "transforms": transforms.summary(counts)}
     told |= {"taken": taken} if taken else {}
     return summary | told | ({"height": dict(heights.record)} if heights.record else {})

@@ -24,6 +24,8 @@ _MAYBE_SETPOINT = re.compile(r"target_(pose|position|point|location|local|global
 """A name that autopilots use for a set-point, and others for where the target is."""
 _ONLY_WITH: Final = {"TransformStamped": TRUTH_WORDS, "GeoJSON": DETECTION_WORDS}
 """Presets that are not suggested but for topics with one of these words."""
+_MMSI: Final = re.compile(r"(?<=/)[2-7][0-9]{8}(?=/|$)")
+"""Of ships, by the country: stations ashore and buoys begin with another digit (ITU-R M.585)."""
 _OBSTACLE = {"obstacle", "obstacles", "map", "costmap", "grid", "keepout", "nogo"}
 _TF_SCHEMAS = {"TFMessage", "tfMessage", "TransformStamped", "FrameTransform", "FrameTransforms"}
 _OBSTACLE_SCHEMAS = {"OccupancyGrid", "Grid", "GeoJSON"}
@@ -197,8 +199,15 @@ def _unread_bearings(topic: str, paths: Mapping[str, str]) -> SourceConfig:
 def _sources(channels: Sequence[ChannelLike], role: Role) -> tuple[SourceConfig, ...]:
     """One source a pattern: topics of one type that differ only in a name share it."""
     topics = [channel.topic for channel in channels]
-    found = {(pattern_of(c.topic, role, not _holds_several(c), topics), usable_type(c)): None for c in channels}
+    found = {(_pattern(c, role, topics), usable_type(c)): None for c in channels}
     return tuple(_source(pattern, known) for pattern, known in found)
+
+
+def _pattern(channel: ChannelLike, role: Role, topics: Sequence[str]) -> str:
+    """The topic with placeholders; of ships it may hold their MMSI, which messages then leave out (Digitraffic)."""
+    if usable_type(channel) == "AIS" and _MMSI.search(channel.topic):
+        return _MMSI.sub("{agent}", channel.topic, count=1)
+    return pattern_of(channel.topic, role, not _holds_several(channel), topics)
 
 
 def _source(pattern: str, known: str | None) -> SourceConfig:

@@ -39,6 +39,7 @@ class MessageType:
     range, bearing, elevation, range_rate  what a sensor measured from where it was, and their standard deviations (..._sigma)
     range_sigma_m, bearing_sigma_deg, elevation_sigma_deg, range_rate_sigma_mps  where messages state none
     pixel_x, pixel_y, box_width, box_height  what a camera saw: right and down from the corner of its image, and how large
+    axes             zero where x, y and z are along frame_convention, by what the message says
     origin_latitude, origin_longitude  where on the earth x and y count from, where the type says so
     bearing_unit     of bearing, elevation and their standard deviations
     bearing_convention  what a bearing counts from
@@ -79,6 +80,7 @@ class MessageType:
     box_height: Paths = ()
     origin_latitude: Paths = ()
     origin_longitude: Paths = ()
+    axes: Paths = ()
     range_sigma_m: float | None = None
     bearing_sigma_deg: float | None = None
     elevation_sigma_deg: float | None = None

@@ -47,6 +47,7 @@ POSES: Final[dict[str, MessageType]] = {
         y=("position[1]", "y"),
         z=("position[2]", "z"),
         covariance=("position_variance", "pose_covariance"),
+        axes=("pose_frame.@sub(1)", "local_frame"),
         frame_convention="ned",
         vertical_datum="frame",
     ),

@@ -257,7 +257,10 @@ def test_north_east_down(tmp_path: Path) -> None:
     np.testing.assert_allclose(places(found), [[5, 12, -30], [5, 13, -30], [5, 14, -30]])
     columns = [found.detections[name][0].as_py() for name in ("cov_xx_m2", "cov_xy_m2", "cov_yy_m2")]
     assert columns == pytest.approx([4.0, 1.0, 9.0]) and found.frame.frame_id == "local_ned_enu"
-    assert run(tmp_path, rows).detections["x_m"].to_pylist() == [12.0, 13.0, 14.0]
+    by_name = run(tmp_path, rows)
+    assert by_name.detections.equals(found.detections) and by_name.summary["north_by_name"] == 3
+    stated = run(tmp_path, rows, detections=[{"topic": "/detections", "frame_convention": "enu"}])
+    assert stated.detections["x_m"].to_pylist() == [12.0, 13.0, 14.0] and "north_by_name" not in stated.summary
 
 
 def test_what_was_left_out_is_told_in_one_line_each(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -272,7 +275,7 @@ def test_what_was_left_out_is_told_in_one_line_each(tmp_path: Path, capsys: pyte
     assert "1 position has no transform near enough in time" in told
     ned = write_log(tmp_path / "ned.mcap", [detection(float(i), i, i, frame="local_ned") for i in range(3)])
     write_tables(open_log(ned), tmp_path, ExtractConfig(), Progress())
-    assert 'give its sources frame_convention = "ned"' in capsys.readouterr().err
+    assert "3 positions are north, east, down by their frame's name and were turned" in capsys.readouterr().err
 
 
 def test_a_sensor_in_a_world_that_is_north_east_down(tmp_path: Path) -> None:

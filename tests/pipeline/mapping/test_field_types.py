@@ -14,6 +14,7 @@ from pipeline.extract.channel_reader import ChannelReader
 from pipeline.extract.positions import Positions
 from pipeline.extract.reading import read_positions
 from pipeline.logs.reader import open_log
+from pipeline.mapping.guess import suggest_mapping
 from pipeline.mapping.message_types import type_of_schema
 from pipeline.mapping.sources import SourceConfig
 from pipeline.progress import Progress
@@ -168,6 +169,14 @@ def test_json_of_ais_decoders(tmp_path: Path, message: dict[str, Any], expected:
     assert list(zip(rows.agent, rows.first, strict=True)) == [*expected, ("1", 50.0)] and set(rows.second) == {-1.25}
     if expected and ("time" in message or "MetaData" in message):
         assert rows.time_ns[0] == START_NS + 5 * 10**9
+
+
+def test_ships_that_only_their_topics_name(tmp_path: Path) -> None:
+    """As Digitraffic has it: the MMSI is a part of the topic, and the message repeats it not."""
+    topics = [f"/ais/vessels-v2/{mmsi}/location" for mmsi in ("230000001", "230000002", "002300001")]
+    rows = [Row(topic, "", float(i), {"lat": 60.0 + 1e-4 * i, "lon": 20.0}) for i in range(5) for topic in topics]
+    (source, other) = suggest_mapping(open_log(write_log(tmp_path / "a.mcap", rows)).channels).detections
+    assert source.topic == "/ais/vessels-v2/{agent}/location" and other.agent is None and "{agent}" not in other.topic
 
 
 @pytest.mark.parametrize(
