@@ -41,6 +41,8 @@ _CLASSES: Final = {
     "horse", "deer", "cow", "sheep", "cone", "object", "obstacle", "other", "background",
 }  # fmt: skip
 """Kinds of targets, as detectors are trained for them."""
+_SCORE: Final = re.compile(r"[^a-z0-9.]*(?:[01]?\.[0-9]+|[01]\.|[0-9]{1,3}(?:\.[0-9]+)?\s*%)[^a-z0-9]*$")
+"""What a picture has behind a kind: `car 0.87`, `person: 93%`."""
 _CLASS_WORDS: Final = {"type", "class", "label", "category", "human", "adult", "movable", "static", "small", "large", "motor"}
 """What stands beside such a kind in the names of labels: `vehicle.car`, `TYPE_PEDESTRIAN`."""
 
@@ -114,7 +116,7 @@ def _is_fill_in(name: str) -> bool:
 
 
 def _is_class(name: str) -> bool:
-    words = [word for word in re.split(r"[^a-z0-9]+", name.lower()) if word]
+    words = [word for word in re.split(r"[^a-z0-9]+", _SCORE.sub("", name.lower())) if word]
     return not _CLASSES.isdisjoint(words) and _CLASSES.union(_CLASS_WORDS).issuperset(words)
 
 

@@ -21,8 +21,11 @@ from pipeline.suspicions import Suspicions, listed
 _MAX_ODD: Final = 0.3
 """Of the steps of a name: noise alone makes a target seem to leave and come back in one step of twelve."""
 _MIN_ROWS: Final = 4
-_COUNTED: Final = re.compile(r"(?:(?:track|trk|object|obj|id|target)[^a-z0-9]*)?[0-9]{1,5}")
-"""Numbers that a tracker counts; those of ships and aircraft have more digits."""
+_COUNTED: Final = re.compile(
+    r"(?:(?:track|trk|object|obj|id|target|det|detection|cluster|blob|person|people|human|ped|pedestrian|car|truck|bus|van|"
+    r"bicycle|bike|cyclist|motorcycle|motorbike)[^a-z0-9]*)?[0-9]{1,5}"
+)
+"""Numbers that a tracker counts, also behind a kind; those of ships and aircraft have more digits, and vehicles have names."""
 _SETTING: Final = "has_identity (true: names are believed, false: none is) in its [[extract.detections]]"
 
 

@@ -27,13 +27,16 @@ def test_a_name_of_two_places_in_one_message_is_nobody() -> None:
     assert judged(rows(*shared, *alone), believed="/seen") == (["T"] * 40 + ["B"] * 20, [])
 
 
-@pytest.mark.parametrize("label", ["car", "CAR", "vehicle.car", "human.pedestrian.adult", "TYPE_PEDESTRIAN", "label/boat"])
+LABELS = ["car", "CAR", "vehicle.car", "human.pedestrian.adult", "TYPE_PEDESTRIAN", "label/boat", "car 0.87", "person: 93%"]
+
+
+@pytest.mark.parametrize("label", LABELS)
 def test_a_label_is_nobody(label: str) -> None:
     names, lines = judged(rows(*[(i, float(i), 2.0 * i, 0.0, label) for i in range(20)]))
     assert names == [None] * 20 and f'"{label}" is what was seen, not who' in lines[0]
 
 
-@pytest.mark.parametrize("name", ["car 3", "red.car", "car_7", "type", "adult", "boat-anna"])
+@pytest.mark.parametrize("name", ["car 3", "car3.14", "red.car", "car_7", "type", "adult", "boat-anna"])
 def test_a_name_with_a_kind_in_it_stays(name: str) -> None:
     assert judged(rows(*[(i, float(i), 2.0 * i, 0.0, name) for i in range(20)])) == ([name] * 20, [])
 

@@ -34,6 +34,17 @@ def test_a_name_that_is_given_out_again_becomes_two() -> None:
     assert named(found, believed="/seen") == (["7"] * 60, [])
 
 
+@pytest.mark.parametrize(("kind", "num"), [("car_", 4), ("", 4), ("Person-", 4), ("rover", 2), ("boat 1", 2)])
+def test_numbers_by_the_order_of_places_change_where_targets_pass(kind: str, num: int) -> None:
+    """Two cars meet, and from then on the first in the list is the other one."""
+    items = [
+        (i, float(i), *place, f"{kind}{k}")
+        for i in range(60) for k, place in enumerate(sorted([(3.0 * i, 0.0), (151.0 - 3.0 * i, 40.0)]))
+    ]  # fmt: skip
+    names, lines = named(rows(*items))
+    assert len(set(names)) == num and len(lines) == (num > 2)
+
+
 def test_three_targets_and_one_that_comes_back() -> None:
     found = rows(*car(0, 9, 0, 0, 9), *car(10, 19, 5e3, 0, 9), *car(20, 29, 180, 0, 9), *car(30, 39, 0, -8e3, 9))
     assert named(found)[0] == ["7"] * 10 + ["7.2"] * 10 + ["7"] * 10 + ["7.3"] * 10
