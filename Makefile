@@ -8,7 +8,7 @@ SOURCES := cli.py cadence pipeline schemas tests benchmarks docs/generate.py
 DEMO := out/demo
 COVERAGE := out/coverage.json
 LINES := out/lines
-PARALLEL := -n auto --maxprocesses 4 --dist loadfile
+PARALLEL := -n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 
 .DEFAULT_GOAL := help
 .PHONY: help setup demo test suite lint style types check ray fix docs bench clean

@@ -19,7 +19,7 @@ from pipeline.batch.outcome import LogOutcome, LogTask
 from pipeline.batch.tasks import STAGES, RunTask, Watch
 from pipeline.progress import RelayedProgress, Told
 
-PRELOADED = ["pipeline.batch.run", *(f"pipeline.{stage}.writing" for stage in STAGES)]
+PRELOADED = ["pipeline.batch.run", "pipeline.estimators.general", *(f"pipeline.{stage}.writing" for stage in STAGES)]
 """What workers need, so that they start with it and share its memory."""
 
 _GRACE_S = 10.0

@@ -22,6 +22,7 @@ from pipeline.scoring.scores import METRICS, Cells, compare, energy_ratio, group
 from pipeline.tables import Frame, read_table, write_table
 
 QUIET = Progress(quiet=True)
+pytestmark = pytest.mark.usefixtures("few_map_cells")
 SIMPLE = EvaluateConfig(rivals=("linear", "hold"), num_resamples=50)
 
 

@@ -26,6 +26,7 @@ from pipeline.windows import build_windows
 from schemas.tables import TRUTH
 
 QUIET = Progress(quiet=True)
+pytestmark = pytest.mark.usefixtures("few_map_cells")
 NUM_STEPS, ORIGIN = 4, 1
 
 

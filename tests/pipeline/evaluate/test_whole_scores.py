@@ -19,6 +19,7 @@ from pipeline.scoring.case import read_case
 from pipeline.stories import Block, MissionStories, read_stories, seconds_since, write_stories
 
 QUIET = Progress(quiet=True)
+pytestmark = pytest.mark.usefixtures("few_map_cells")
 ALONE = EvaluateConfig(rivals=(), num_resamples=50)
 BEGIN_S, NUM_STEPS = 20, 121  # from 20 to 140 s
 
