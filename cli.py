@@ -388,19 +388,25 @@ def evaluate(
     _show(evaluate_any(mission, checkpoint, out, resolved, Progress(quiet), force), as_json)
 
 
-class _OneMission(TyperGroup):
-    """Where a pattern of the shell made several words of the mission, the second one is no question."""
+class _Missions(TyperGroup):
+    """All words before the question are missions: a pattern of the shell makes several of one."""
+
+    def parse_args(self, ctx: typer.Context, args: list[str]) -> list[str]:  # type: ignore[override]
+        """The rest of the words, behind the first mission; all missions are kept in `ctx.meta`."""
+        asked = next((number for number, word in enumerate(args) if number and word in self.commands), 1)
+        ctx.meta["missions"] = [Path(word) for word in args[:asked]]
+        return super().parse_args(ctx, args[:1] + args[asked:])
 
     def resolve_command(self, ctx: typer.Context, args: list[str]) -> Any:  # type: ignore[override]
         """The question; `UsageError` where it is a path."""
         if Path(args[0]).exists() and args[0] not in self.commands:
-            raise UsageError(f"ask is about one mission: give one folder, not {ctx.params.get('mission')} and {args[0]}")
+            raise UsageError(f"ask: no question behind {args[0]}; name one of {', '.join(self.commands)}")
         return super().resolve_command(ctx, args)
 
 
 questions = typer.Typer(
     name="ask",
-    cls=_OneMission,
+    cls=_Missions,
     add_completion=False,
     rich_markup_mode=None,
     no_args_is_help=True,
@@ -409,11 +415,12 @@ questions = typer.Typer(
     Answers come from mission hypotheses (given all that was detected), or with --as-of from what was known at a moment. AREA is
     a GeoJSON file or text, a circle `latitude,longitude,metres` (`x,y,metres` where the log is not georeferenced), or the name
     of an obstacle; LINE likewise, or two points and more. Times are ISO 8601, a time of day (UTC), or seconds after the log
-    begins.
+    begins. Several missions are asked one after the other.
 
     \b
     Examples:
       cadence ask results/flight where --at 10:12:30 --out places
+      cadence ask results/* where --at 600
       cadence ask results/flight inside 50.76,-1.29,2000 --from 10:00 --to 11:00 --dwell 600
       cadence ask results/flight meet --within 500 --for 60 --json
     """,
@@ -429,14 +436,14 @@ Area = Annotated[str, typer.Argument(metavar="AREA", help="GeoJSON, a circle, or
 
 @questions.callback()
 def _ask(context: typer.Context, mission: Mission) -> None:
-    context.obj = mission
+    context.obj = context.meta["missions"]
 
 
-def _answer(context: typer.Context, as_json: bool, out: Path | None = None, **stated: object) -> None:
+def _answer(context: typer.Context, as_json: bool, out: Path | None = None, **stated: object) -> int:
     from pipeline.ask.question import Question
-    from pipeline.ask.spoken import ask
+    from pipeline.ask.spoken import ask_each
 
-    typer.echo(ask(context.obj, Question.asked(**stated), out, as_json))
+    return ask_each(context.obj, Question.asked(**stated), out, as_json, typer.echo, _complain, Progress().note)
 
 
 @questions.command()
@@ -445,9 +452,9 @@ def where(
     agent: OneAgent = None, as_of: AsOf = None,
     out: Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Write GeoJSON, GeoTIFF and a map there.")] = None,
     as_json: Json = False,
-) -> None:  # fmt: skip
+) -> int:  # fmt: skip
     """Where it was: areas that hold 50, 90 and 95 %."""
-    _answer(context, as_json, out, ask="where", at=at, agent=agent, as_of=as_of)
+    return _answer(context, as_json, out, ask="where", at=at, agent=agent, as_of=as_of)
 
 
 @questions.command(context_settings=_MINUS)
@@ -455,18 +462,18 @@ def inside(
     context: typer.Context, area: Area, start: From = None, end: To = None,
     dwell: Annotated[float, typer.Option("--dwell", metavar="S", help="For so many seconds without a break.")] = 0.0,
     agent: OneAgent = None, as_of: AsOf = None, as_json: Json = False,
-) -> None:  # fmt: skip
+) -> int:  # fmt: skip
     """Whether it was in AREA, since when, until when."""
-    _answer(context, as_json, ask="inside", area=area, start=start, end=end, dwell_s=dwell, agent=agent, as_of=as_of)
+    return _answer(context, as_json, ask="inside", area=area, start=start, end=end, dwell_s=dwell, agent=agent, as_of=as_of)
 
 
 @questions.command(context_settings=_MINUS)
 def arrive(
     context: typer.Context, area: Area, start: From = None, end: To = None, agent: OneAgent = None, as_of: AsOf = None,
     as_json: Json = False,
-) -> None:  # fmt: skip
+) -> int:  # fmt: skip
     """Whether it came into AREA from outside, when, and where over its border."""
-    _answer(context, as_json, ask="arrive", area=area, start=start, end=end, agent=agent, as_of=as_of)
+    return _answer(context, as_json, ask="arrive", area=area, start=start, end=end, agent=agent, as_of=as_of)
 
 
 @questions.command(context_settings=_MINUS)
@@ -474,9 +481,9 @@ def passed(
     context: typer.Context,
     line: Annotated[str, typer.Argument(metavar="LINE", help="GeoJSON, or points 'A,B C,D'.", show_default=False)],
     start: From = None, end: To = None, agent: OneAgent = None, as_of: AsOf = None, as_json: Json = False,
-) -> None:  # fmt: skip
+) -> int:  # fmt: skip
     """Whether it crossed LINE, when, where, and to which side."""
-    _answer(context, as_json, ask="passed", line=line, start=start, end=end, agent=agent, as_of=as_of)
+    return _answer(context, as_json, ask="passed", line=line, start=start, end=end, agent=agent, as_of=as_of)
 
 
 @questions.command()
@@ -487,12 +494,12 @@ def meet(
     during: Annotated[float, typer.Option("--for", metavar="S", help="Seconds without a break.")] = 0.0,
     every: Annotated[bool, typer.Option("--all", help="All pairs, as without names.")] = False,
     start: From = None, end: To = None, as_of: AsOf = None, as_json: Json = False,
-) -> None:  # fmt: skip
+) -> int:  # fmt: skip
     """Whether two came within M metres of each other, when and where."""
     one, other = [*(agents or ()), None, None][:2]
     if len(agents or ()) > 2 or (agents and every):
         raise UsageError("meet is about two agents, or about all")
-    _answer(
+    return _answer(
         context, as_json, ask="meet", agent=one, other=other, within_m=within, for_s=during, start=start, end=end, as_of=as_of
     )
 
@@ -504,9 +511,9 @@ def same(
     other: Annotated[str, typer.Argument(metavar="B", help="Another one.", show_default=False)],
     within: Annotated[float | None, typer.Option("--within", metavar="M", help="Further apart they are two.")] = None,
     as_of: AsOf = None, as_json: Json = False,
-) -> None:  # fmt: skip
+) -> int:  # fmt: skip
     """How likely two detections, or two tracks, are of one target."""
-    _answer(context, as_json, ask="same", agent=one, other=other, within_m=within, as_of=as_of)
+    return _answer(context, as_json, ask="same", agent=one, other=other, within_m=within, as_of=as_of)
 
 
 @questions.command()
@@ -517,9 +524,9 @@ def searched(
     agent: OneAgent = None,
     as_of: AsOf = None,
     as_json: Json = False,
-) -> None:
+) -> int:
     """How much of where it may have been the sensors swept, and where one more look would have paid most."""
-    _answer(context, as_json, ask="searched", start=start, end=end, agent=agent, as_of=as_of)
+    return _answer(context, as_json, ask="searched", start=start, end=end, agent=agent, as_of=as_of)
 
 
 @app.command()

@@ -9,6 +9,12 @@ def nice_length(length: float) -> float:
     return max(factor * power for factor in (1, 2, 5) if factor * power <= length * (1 + 1e-9))
 
 
+def three_digits(value: float) -> str:
+    """A number for people: 0.123, 12.3, 1,230; no powers of ten where thousands with commas will do."""
+    rounded = float(f"{value:.3g}")
+    return f"{rounded:,.0f}" if 100 <= abs(rounded) < 1e15 else f"{value:.3g}"
+
+
 def metres(length_m: float) -> str:
     """A length for people: three digits, in km from 1000 m on; nobody cares for millimetres."""
     if not math.isfinite(length_m):

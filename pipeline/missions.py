@@ -45,7 +45,8 @@ class Mission:
 def no_mission(path: Path) -> InputError:
     """What is said of a path that is no mission directory, with the way on."""
     if path.is_file():
-        return InputError(f"{path}: is a file, not a mission directory; `cadence run {path} --out results` makes one of a log")
+        on = f"; `cadence run {path} --out results` makes one of a log" if _is_log_name(path.name) else ""
+        return InputError(f"{path}: is a file, not a mission directory{on}")
     inside = sorted(catalogue.parent for catalogue in path.glob(f"*/{CATALOGUE_NAME}"))
     if inside:
         held = counted(len(inside), "mission directory", "mission directories")

@@ -1,4 +1,4 @@
-"""Progress bars and notes on stderr; stdout is left to results."""
+"""Progress bars (on a terminal alone) and notes on stderr; stdout is left to results."""
 
 import sys
 from collections.abc import Callable
@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from tqdm import tqdm
+
+from pipeline.counted import counted
 
 _MIN_SHARE = 0.01
 
@@ -19,16 +21,24 @@ class Progress:
     def bar(self, total: int | None, label: str, unit: str = "it", scale: bool = False) -> "tqdm[Any]":
         """A bar to `update(n)` and `close()` (or use as a context manager); `scale` prints k, M, G for bytes."""
         return tqdm(
-            total=total, desc=label, unit=unit, unit_scale=scale, disable=self.quiet, file=sys.stderr, leave=False,
+            total=total, desc=label, unit=unit, unit_scale=scale, disable=self._is_hidden, file=sys.stderr, leave=False,
             dynamic_ncols=True, mininterval=0.2,
         )  # fmt: skip
 
     def percent(self, label: str) -> "tqdm[Any]":
         """A bar from 0 to 1 for work whose pieces are not alike, so that a rate would say nothing: set `n` and `refresh`."""
         return tqdm(
-            total=1.0, desc=label, disable=self.quiet, file=sys.stderr, leave=False, dynamic_ncols=True,
-            bar_format="{desc}: {percentage:3.0f}%|{bar}| {elapsed}, {remaining} left{postfix}",
+            total=1.0, desc=label, disable=self._is_hidden, file=sys.stderr, leave=False, dynamic_ncols=True,
+            bar_format="{desc}: {percentage:3.0f}%|{bar}| {elapsed}{postfix}",
         )  # fmt: skip
+
+    @property
+    def _is_hidden(self) -> bool:
+        """Bars are for terminals; in a file each of their states would be read."""
+        return self.quiet or not sys.stderr.isatty()
+
+    def doing(self, label: str) -> None:
+        """What the work is at, where that is shown and no bar says it."""
 
     def note(self, text: str) -> None:
         """One line for the person who watches."""
@@ -69,9 +79,13 @@ class RelayedProgress(Progress):
         def told(done: float, share: float) -> None:
             self.tell(self.begin + share * (self.end - self.begin))
             if unit != "B":  # of bytes the share says enough
-                self.tell(Doing(f"{label} {done:.0f} of {total} {unit}s"))
+                self.tell(Doing(f"{label} {done:.0f} of {counted(total or 0, unit)}"))
 
         return _ToldBar(total, told)
+
+    def doing(self, label: str) -> None:
+        """As above."""
+        self.tell(Doing(label))
 
     def note(self, text: str) -> None:
         """Tell one line."""

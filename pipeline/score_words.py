@@ -24,15 +24,20 @@ METRICS: Final[Mapping[str, str]] = {
 mean distance of one hypothesis, and the share of the truth that lies in the region of 90 % of the weight (90 % is right)."""
 
 
+_RIGHT = 0.9
+
+
 def estimator_words(name: str) -> str:
     """What an estimator is called in a table."""
     return ESTIMATORS.get(name, name)
 
 
-def coverage_words(held: float) -> str:
-    """What a region of 90 % is worth that holds this share of the truth."""
+def coverage_words(held: float, low: float = math.nan, high: float = math.nan) -> str:
+    """What a region of 90 % is worth that holds this share of the truth; `low` and `high` are the interval of the share."""
     limits = ((0.5, "do not believe it"), (0.83, "it is too narrow"), (0.96, "as it should"), (math.inf, "it is too wide"))
-    return next(words for limit, words in limits if held <= limit)
+    words = next(words for limit, words in limits if held <= limit)
+    is_chance = low <= _RIGHT <= high and not words.startswith("as")
+    return f"{words}, which may be chance" if is_chance else words
 
 
 def value_words(metric: str, value: float | None) -> str:

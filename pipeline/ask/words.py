@@ -9,6 +9,7 @@ import numpy as np
 from cadence.answers.estimates import Law, Probability
 from pipeline.clock import Clock, duration
 from pipeline.frames import to_geodetic
+from pipeline.lengths import three_digits
 from pipeline.tables import Frame
 
 
@@ -50,7 +51,7 @@ def place_words(frame: Frame, place_m: tuple[float, float]) -> str:
 
 def area_words(area_m2: float) -> str:
     """An area for people, three digits, in km² from a tenth on."""
-    return f"{area_m2 / 1e6:,.3g} km²" if area_m2 >= 1e5 else f"{float(f'{area_m2:.3g}'):,.6g} m²"
+    return f"{three_digits(area_m2 / 1e6)} km²" if area_m2 >= 1e5 else f"{three_digits(area_m2)} m²"
 
 
 def numbers(found: Any) -> Any:

@@ -34,6 +34,8 @@ from pipeline.threads import num_cores
 
 _WORKER_BYTES = 2_000_000_000
 _MEMINFO = Path("/proc/meminfo")
+_LEAST_SHARE = 0.1
+"""Of the work, that must be done for the time it took to say how long the rest takes."""
 
 EngineName = Literal["local", "ray"]
 
@@ -150,7 +152,7 @@ class _Shown:
     def __init__(self, tasks: Sequence[LogTask], progress: Progress) -> None:
         self._progress, self._num_tasks, self._num_finished = progress, len(tasks), 0
         self._shares = {task.index: 0.0 for task in tasks}
-        self._bar = progress.percent("run")
+        self._bar, self._begun_s = progress.percent("run"), time.monotonic()
 
     def watch(self, task: LogTask, told: Told) -> None:
         """A line of text, what the task is at, or how much of it is done."""
@@ -163,6 +165,9 @@ class _Shown:
             self._shares[task.index] = told
             # Missions count alike: the size of a log says little about the work in it.
             self._bar.n = min(sum(self._shares.values()) / self._num_tasks, 1.0)
+            if self._num_tasks > 1 and self._bar.n > _LEAST_SHARE:
+                left_s = (time.monotonic() - self._begun_s) * (1.0 / self._bar.n - 1.0)
+                self._bar.set_postfix_str(f"about {tqdm.format_interval(left_s)} left", refresh=False)
             self._bar.refresh()
 
     def finished(self, outcome: LogOutcome) -> None:

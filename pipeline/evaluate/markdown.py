@@ -4,6 +4,8 @@ import math
 from collections.abc import Iterable, Sequence
 from typing import Protocol, TypeVar
 
+from pipeline.lengths import three_digits
+
 Item = TypeVar("Item")
 
 
@@ -35,11 +37,11 @@ def line(cells: Sequence[str]) -> str:
 
 def value(row: Number | None) -> str:
     """Three digits, or a dash."""
-    return "–" if row is None or math.isnan(row.value) else f"{row.value:.3g}"
+    return "–" if row is None or math.isnan(row.value) else three_digits(row.value)
 
 
 def with_interval(row: Number | None) -> str:
     """The value, and its interval where it has one."""
     if row is None or math.isnan(row.low):
         return value(row)
-    return f"{row.value:.3g} [{row.low:.3g}, {row.high:.3g}]"
+    return f"{three_digits(row.value)} [{three_digits(row.low)}, {three_digits(row.high)}]"

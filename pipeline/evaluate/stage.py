@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
+from tqdm import tqdm
 
 from cadence.errors import CadenceError, InputError, UsageError
 from cadence.types import Estimator, WindowBatch
@@ -27,7 +28,7 @@ from pipeline.forecast.stage import ForecastConfig, evaluate_forecasts
 from pipeline.manifest import StageResult, check_chain, manifest_path, run_stage
 from pipeline.missions import is_mission_directory
 from pipeline.obstacle_file import OBSTACLES_NAME
-from pipeline.progress import Progress
+from pipeline.progress import Doing, Progress, RelayedProgress, Told
 from pipeline.results import read_hypothesis_tables
 from pipeline.scoring.case import LABELS_NAME, Case, collision_test, mission_obstacles, read_case
 from pipeline.scoring.motion import MotionLaws, true_motion
@@ -112,6 +113,23 @@ def evaluate(directory: Path, config: EvaluateConfig, progress: Progress, force:
     return run_stage("evaluate", directory, config=config, inputs=inputs, body=body, force=force)
 
 
+@dataclass(frozen=True, eq=False)
+class _ShownIn:
+    """One bar over all logs: what is told of one moves it."""
+
+    bar: "tqdm[Any]"
+    name: str
+    progress: Progress
+
+    def tell(self, told: Told) -> None:
+        """A share of the whole, or a line; what a log is at is which it is."""
+        if isinstance(told, float):
+            self.bar.n = told
+            self.bar.set_postfix_str(self.name)
+        elif not isinstance(told, Doing):
+            self.progress.note(told)
+
+
 def evaluate_folder(folder: Path, config: EvaluateConfig, progress: Progress) -> StageResult:
     """Pooled scores of all mission directories in `folder`, written there; intervals over logs where there are six or more.
 
@@ -123,15 +141,17 @@ def evaluate_folder(folder: Path, config: EvaluateConfig, progress: Progress) ->
             f"{folder}: holds no mission directory with hypotheses.parquet; `cadence run LOG --out results` makes one"
         )
     scored, failures = [], []
-    with progress.bar(len(directories), "evaluate", "log") as bar:
-        for directory in directories:
+    with progress.percent("evaluate") as bar:
+        for number, directory in enumerate(directories, 1):
+            inner = _ShownIn(bar, f"{number} of {len(directories)}", progress)
+            share = RelayedProgress(tell=inner.tell).part((number - 1) / len(directories), number / len(directories))
             try:
                 check_chain("evaluate", directory, {})
-                scored.append(score_mission(directory, config, progress))
+                scored.append(score_mission(directory, config, share))
+                progress.note(f"[{number}/{len(directories)}] {directory.name}: scored")
             except CadenceError as error:
                 failures.append(error)
                 progress.warn(str(error))
-            bar.update(1)
     if not scored:
         raise failures[0]
     summary = _write_scores(scored, folder, config) | {"num_failed": len(failures)}

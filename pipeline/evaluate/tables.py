@@ -230,15 +230,16 @@ def _entered(logs: Sequence[ScoredLog]) -> Iterator[str]:
 def _verdict(report: ScoreReport, part: str) -> list[str]:
     best = max((ratio for ratio in report.ratios if ratio.part == part), key=lambda ratio: ratio.value, default=None)
     own = [row for row in report.rows if (row.estimator, row.part, row.by) == (OWN_NAME, part, "part")]
-    held = next((row.value for row in own if row.metric == "coverage_90"), None)
+    held = next((row for row in own if row.metric == "coverage_90"), None)
     sentences = []
     if best is not None:
         rival, away = estimator_words(best.rival), f"{abs(1 - best.value):.0%}".replace("%", " %")
         apart = f"{away} {'below' if best.value < 1 else 'above'} that of the best rival ({rival})"
         is_certain = best.high < 1 or best.low > 1
         sentences.append(f"the energy score is {apart}{'' if is_certain else ', which may be chance'};")
-    if held is not None and math.isfinite(held):
-        sentences.append(f"the 90 % region holds {100 * held:.0f} % of the truth: {coverage_words(held)}.")
+    if held is not None and math.isfinite(held.value):
+        judged = coverage_words(held.value, held.low, held.high)
+        sentences.append(f"the 90 % region holds {100 * held.value:.0f} % of the truth: {judged}.")
     return sentences
 
 

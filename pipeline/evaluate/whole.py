@@ -195,8 +195,8 @@ def whole_verdict(rows: Sequence[ScoreRow]) -> Iterator[str]:
         return
     away = f"{100 * abs(1 - ratio.value):.0f} % {'below' if ratio.value < 1 else 'above'}"
     chance = "" if ratio.high < 1 or ratio.low > 1 else ", which may be chance"
-    words = estimator_words(WHOLE_NAME)
+    words, judged = estimator_words(WHOLE_NAME), coverage_words(held.value, held.low, held.high)
     yield (
         f"{words[:1].upper()}{words[1:]}: on the steps between first and last detection the energy score is {away} that of the "
-        f"windows{chance}; the 90 % region holds {100 * held.value:.0f} % of the truth: {coverage_words(held.value)}."
+        f"windows{chance}; the 90 % region holds {100 * held.value:.0f} % of the truth: {judged}."
     )

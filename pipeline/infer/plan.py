@@ -32,6 +32,13 @@ from pipeline.stream_words import stream_words
 from pipeline.suspicions import Suspicions
 from pipeline.windows import MissionWindows, build_windows
 
+_SHARE_APART = 0.4
+"""Of the time, what telling detections apart takes where there is something to tell apart."""
+_FIT_AS_DRAWN = 4.0
+"""Fitting takes about as long as drawing so many windows of an agent."""
+_FIT_STEPS = 10
+"""Of fitting: tests one, the bank four, the network's part three, silence what is left."""
+
 
 @dataclass(frozen=True, eq=False)
 class Beside:
@@ -96,6 +103,7 @@ class Plan:
     suspicions: Suspicions
     max_speed_mps: float | None
     has_evidence: bool
+    left: Progress
     remarks: tuple[str, ...] = ()
 
     @property
@@ -106,9 +114,13 @@ class Plan:
 
     @staticmethod
     def of(config: InferConfig, detections: pa.Table, beside: Beside, progress: Progress) -> "Plan":
-        """The draws of a log by the checkpoint, which decides the grid as well, or by the default one where it does not fit."""
+        """The draws of a log by the checkpoint, which decides the grid as well, or by the default one where it does not fit.
+
+        `progress` is that of the whole stage; `left` is the part that drawing takes.
+        """
         loaded = load_estimator(config.checkpoint, config.samplings)
-        seen = Seen.of(config, detections, loaded, progress)
+        seen = Seen.of(config, detections, loaded, progress.part(0.0, _SHARE_APART))
+        fitting, left = _shares(seen, progress)
         data = FittingData.of(seen.sources.named, seen.sources.grid, seen.named, config.default_sigma_m)
         suspicions, about = Suspicions(), seen.about(config.association)
         if config.is_tested and loaded.fit is None:
@@ -118,11 +130,12 @@ class Plan:
                 plan = Plan.of(replace(config, checkpoint=DEFAULT), detections, beside, progress)
                 return replace(plan, suspicions=suspicions, about={**plan.about, "fit_test": asdict(test)})
             about["fit_test"] = None if test is None else asdict(test)
-        fitted = _with_heights(loaded.fitted(data), data)
+        fitted = _with_heights(_fitted(loaded, data, fitting), data)
         knows, start_ns = loaded.knows_standing, beside.start_ns
         if seen.associated is None:
             seen = replace(seen, named=with_unseen(seen.named, beside.measurements, config.evidence))
         given = beside.looks, beside.obstacles, config.evidence, fitted.estimator
+        fitting.doing("infer: asking what silence tells" if beside.looks else "infer: drawing")
         silence = hear_silence(*given, seen.named, start_ns, knows)
         names = seen.named.agent_ids if seen.associated is None else seen.associated.windows.agent_ids
         measured = hear_measurements(beside.measurements, config.evidence, names)
@@ -142,14 +155,36 @@ class Plan:
             draws = draw(fitted.estimator, associated, num, config.evidence)
         about = {**fitted.about, **about, **silence.about, **measured.about}
         limit_mps = config.guidance.max_speed_mps
-        return Plan(
-            config.checkpoint, seen, draws, about, suspicions, limit_mps, bool(evidence), (*silence.remarks, *measured.remarks)
-        )
+        remarks = *silence.remarks, *measured.remarks
+        return Plan(config.checkpoint, seen, draws, about, suspicions, limit_mps, bool(evidence), left, remarks)
 
     @property
     def windows(self) -> MissionWindows:
         """What the tables speak of."""
         return self.seen.named if self.seen.associated is None else self.seen.associated.windows
+
+
+def _shares(seen: Seen, progress: Progress) -> tuple[Progress, Progress]:
+    """The progress of fitting and of drawing: what is fitted to is bounded, what is drawn grows with the log."""
+    begin = 0.0 if seen.associated is None else _SHARE_APART
+    num_drawn = int(seen.named.batch.is_active.sum())
+    middle = begin + (1.0 - begin) * _FIT_AS_DRAWN / (_FIT_AS_DRAWN + num_drawn)
+    return progress.part(begin, middle), progress.part(middle, 1.0)
+
+
+def _fitted(loaded: Loaded, data: FittingData, progress: Progress) -> Fitted:
+    """The estimator for one log, what it is fitted with first: each is found once, and kept by `data`."""
+    if loaded.fit is None:
+        return loaded.fitted(data)
+    with progress.bar(_FIT_STEPS, "infer: fit", unit="step") as bar:
+        data.tests  # noqa: B018
+        bar.update(1)
+        data.fitted_bank()
+        bar.update(4)
+        progress.doing("infer: testing on detections held back")
+        fitted = loaded.fitted(data)
+        bar.update(3)
+    return fitted
 
 
 def _with_heights(fitted: Fitted, data: FittingData) -> Fitted:

@@ -38,6 +38,7 @@ def infer(
     start_ns = _mission_start_ns(directory)
 
     def body(folder: Path) -> dict[str, Any]:
+        progress.doing("infer: getting ready")
         from pipeline.infer.writing import write_tables  # only now: a mission that is finished must not cost torch
 
         return write_tables(directory, folder, config, start_ns, num_threads, progress)

@@ -25,8 +25,6 @@ from pipeline.tables import Frame, read_table, write_table
 from pipeline.threads import in_order, num_cores, one_thread
 
 _MANY_NAMELESS = 2000
-_SHARE_APART = 0.4
-"""Of the time, what telling detections apart takes where there is something to tell apart."""
 _FIRST_S, _LONG_S = 5.0, 120.0
 """After how long one knows what is ahead, and from when on somebody who waits wants to have been told."""
 
@@ -45,12 +43,11 @@ def write_tables(
     looks, measurements = read_looks(directory, start_ns), read_measurements(directory, start_ns)
     beside = Beside(start_ns, read_obstacles(directory / OBSTACLES_NAME), looks=looks, measurements=measurements)
     with one_thread():
-        plan = Plan.of(config, detections, beside, progress.part(0.0, _SHARE_APART))
+        plan = Plan.of(config, detections, beside, progress)
         for line in plan.suspicions.lines():
             progress.note(f"infer: suspected {line}")
         drawn = in_order(plan.draws, num_threads or num_cores())
-        drawing = progress if plan.seen.associated is None else progress.part(_SHARE_APART, 1.0)
-        summary = _draw(plan, drawn, str(detections["log_id"][0]), folder, frame, drawing)
+        summary = _draw(plan, drawn, str(detections["log_id"][0]), folder, frame, plan.left)
     if plan.seen.sources.association is not None:
         found = plan.seen.sources.association.rows(detections)
         write_table(found, folder / "associations.parquet", "associations", frame)

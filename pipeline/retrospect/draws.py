@@ -2,7 +2,8 @@
 
 import dataclasses
 import functools
-from collections.abc import Iterator, Sequence
+import threading
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -44,13 +45,26 @@ class MissionDraw:
     after_s: float
     seed: int
 
-    def tracks(self, shares: Sequence[Share], num_threads: int) -> Iterator[tuple[Share, Float64s, int]]:
-        """Each share with its tracks [K', T, 2] in the mission frame, and how many of them the limits asked to mend."""
-        pieces = [functools.partial(self._piece, shares, part) for part in _parts(shares, self.timing)]
+    def tracks(
+        self, shares: Sequence[Share], num_threads: int, on_share: Callable[[float], object]
+    ) -> Iterator[tuple[Share, Float64s, int]]:
+        """Each share with its tracks [K', T, 2] in the mission frame, and how many of them the limits asked to mend.
+
+        `on_share` hears of what is done, half a share when it is drawn and half when it is mended, from one thread at a time.
+        """
+        lock = threading.Lock()
+
+        def heard(share: float) -> None:
+            with lock:
+                on_share(share)
+
+        pieces = [functools.partial(self._piece, shares, part, heard) for part in _parts(shares, self.timing)]
         for piece in in_order(pieces, num_threads):
             yield from piece
 
-    def _piece(self, shares: Sequence[Share], part: Int64s) -> list[tuple[Share, Float64s, int]]:
+    def _piece(
+        self, shares: Sequence[Share], part: Int64s, heard: Callable[[float], object]
+    ) -> list[tuple[Share, Float64s, int]]:
         chosen = [shares[index] for index in part.tolist()]
         num = max(len(share.stories) for share in chosen)
         seeds = derived_seeds(self.seed, "track", part)
@@ -59,12 +73,14 @@ class MissionDraw:
         stated = dataclasses.replace(self.limits, plausible_speed_mps=None)
         keeps = stated.keeps if stated.is_limited else None
         drawn = draw_tracks(self.pool, tracks, self.timeline, num, keeps)
+        heard(0.5 * len(chosen))
         out = []
         for share, position, seed in zip(chosen, drawn, seeds.tolist(), strict=True):
             position, is_mended = self.limits.mended(
                 position[: len(share.stories)], self.timeline.time_s, derived_seed(seed, "limits")
             )
             out.append((share, position.numpy() + self.datum_m, int(is_mended.sum())))
+            heard(0.5)
         return out
 
     def _tracks(self, tracks: Sequence[DetectionTrack], seeds: Int64s) -> Tracks:

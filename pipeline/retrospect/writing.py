@@ -53,10 +53,9 @@ def drawn_stories(
     shape = (config.num_hypotheses, len(sources.agent_ids), len(timing.time_ns), 2)
     position, num_tracks, num_replaced = np.full(shape, np.nan), 0, 0
     with progress.bar(len(sources.shares), "retrospect", unit="track") as bar:
-        for share, drawn, replaced in draw.tracks(sources.shares, num_threads):
+        for share, drawn, replaced in draw.tracks(sources.shares, num_threads, bar.update):
             position[share.stories, share.agent] = drawn
             num_tracks, num_replaced = num_tracks + len(drawn), num_replaced + replaced
-            bar.update(1)
     weight = np.full(config.num_hypotheses, 1.0 / config.num_hypotheses)
     time_s, start_ns, height = draw.timeline.time_s.numpy(), int(timing.time_ns[0]), None
     if data.tracks.height_m is not None:

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 
 import numpy as np
 import pyarrow as pa
@@ -33,7 +34,7 @@ def placed(tmp_path_factory):
 
 
 def ask(capsys, directory, *words):
-    code = cli.main(["ask", str(directory), *words])
+    code = cli.main(["ask", str(directory), *map(str, words)])
     captured = capsys.readouterr()
     return code, captured.out, captured.err
 
@@ -50,7 +51,9 @@ def test_inside_in_words_and_numbers(directory, capsys):
     assert out.startswith(
         "T0 was in the area at some time: 75 % (69 to 80 %); it came in first at 22:14:50; was gone at 22:15:10;"
     )
-    assert out.splitlines()[-2] == "From 200 stories; in brackets what more of them could say."
+    assert out.splitlines()[-2].startswith(
+        "From 200 hypotheses. In brackets: of shares and areas what drawing more could change"
+    )
     assert out.splitlines()[-1].startswith("On measured logs 90 % regions of mission hypotheses held 71 to 98 %")
     (answer,) = told(capsys, directory, "inside", SQUARE, "--agent", "T0")
     assert answer["probability"]["value"] == pytest.approx(0.75)
@@ -215,7 +218,7 @@ CROSSED = feature([-1.2, 50.8], [-1.1, 50.9], [-1.1, 50.8], [-1.2, 50.9], [-1.2,
         (["searched"], "states no footprints", 3),
         (["meet", "T0", "--all", "--within", "5"], "about two agents, or about all", 2),
         (["nonsense"], "No such command 'nonsense'", 2),
-        (["/", "where", "--at", "50"], "ask is about one mission: give one folder", 2),
+        (["/", "--at", "50"], "ask: no question behind /; name one of where, inside,", 2),
     ],
 )  # fmt: skip
 def test_bad_input_is_one_clear_line(placed, words, says, code, capsys):
@@ -223,6 +226,25 @@ def test_bad_input_is_one_clear_line(placed, words, says, code, capsys):
     assert got == code, err
     if code:
         assert out == "" and err.count("\n") == 1 and err.startswith("cadence: error: ") and says in err
+
+
+def test_several_missions_are_asked_and_what_is_none_is_left_out(directory, tmp_path, capsys):
+    batch = tmp_path / "batch.json"
+    batch.touch()
+    other = tmp_path / "other"
+    shutil.copytree(directory, other)
+    code, out, err = ask(capsys, batch, directory, other, "where", "--at", "50", "--agent", "T0")
+    assert code == 0 and err == f"ask: {batch} is no mission directory and is left out\n"
+    named, each = [line for line in out.splitlines() if not line.startswith(" ")], ask(capsys, directory, "where", "--at", "50")
+    assert named == [f"{directory.name}:", "other:"] and f"  {each[1].splitlines()[0]}" in out.splitlines()
+    code, out, _ = ask(capsys, directory, other, "where", "--at", "50", "--json", "--out", tmp_path / "places")
+    assert code == 0 and len(json.loads(out)) == 2
+    assert sorted(path.name for path in (tmp_path / "places").iterdir()) == sorted([directory.name, "other"])
+    (other / "mission.parquet").unlink()
+    code, out, err = ask(capsys, other, directory, "where", "--at", "50")
+    assert code == 3 and out.startswith(f"{directory.name}:") and err.startswith(f"cadence: error: {other}")
+    code, out, err = ask(capsys, batch, batch, "where", "--at", "50")
+    assert code == 3 and out == "" and err.endswith("is a file, not a mission directory\n")
 
 
 def test_results_of_an_older_format_and_empty_ones(tmp_path, capsys):

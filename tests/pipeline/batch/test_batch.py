@@ -2,6 +2,7 @@
 
 import functools
 import os
+import sys
 import threading
 import time
 from pathlib import Path
@@ -208,8 +209,9 @@ def test_bars_are_told_as_shares_of_the_task():
     assert shares[-1] == pytest.approx(0.6, abs=0.005) and shares == sorted(shares)
 
 
-def test_missions_count_alike_in_the_bar_whatever_they_weigh(tmp_path, capsys):
+def test_missions_count_alike_in_the_bar_whatever_they_weigh(tmp_path, capsys, monkeypatch):
     tasks = [LogTask(i, (f"{i}.mcap",), f"out/{i}", size, RunConfig()) for i, size in enumerate((1, 10**12, 7))]
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
     shown = _Shown(tasks, Progress())
     for task in tasks:
         for share in [0.1 * step for step in range(1, 11)]:
@@ -218,6 +220,18 @@ def test_missions_count_alike_in_the_bar_whatever_they_weigh(tmp_path, capsys):
         bar = capsys.readouterr().err.split("\r")[-1]
         assert f"{round(100 * (task.index + 1) / 3)}%|" in bar and "B/s" not in bar and "infer" not in bar
     shown.close()
+
+
+def test_bars_are_for_terminals_and_notes_for_all(capsys, monkeypatch):
+    for is_terminal in (False, True):
+        monkeypatch.setattr(sys.stderr, "isatty", lambda is_terminal=is_terminal: is_terminal)
+        with Progress().bar(3, "extract") as bar, Progress().percent("run") as whole:
+            bar.update(1)
+            whole.n = 0.5
+            whole.set_postfix_str("infer")
+            Progress().note("a line")
+        shown = capsys.readouterr().err
+        assert ("extract" in shown) == is_terminal and ("50%" in shown) == is_terminal and "a line\n" in shown
 
 
 def test_a_defect_comes_back_with_its_traceback(tmp_path, monkeypatch):

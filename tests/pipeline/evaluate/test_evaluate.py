@@ -2,6 +2,7 @@
 
 import json
 import re
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -245,6 +246,24 @@ def test_folder_pools_missions(tmp_path: Path) -> None:
     assert evaluate_folder(folder, EvaluateConfig(rivals=(), num_resamples=20), QUIET).summary["num_failed"] == 1
     with pytest.raises(InputError, match="no mission directory"):
         evaluate_folder(tmp_path / "missions" / "m0", SIMPLE, QUIET)
+
+
+def test_a_folder_shows_one_bar_and_a_line_a_log(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "missions"
+    folder.mkdir()
+    for index in range(2):
+        (folder / f"m{index}").symlink_to(build_mission(tmp_path, num_hypotheses=3) if not index else folder / "m0")
+    config = EvaluateConfig(rivals=("hold",), num_resamples=20)
+    evaluate_folder(folder, config, Progress())
+    assert capsys.readouterr().err == "[1/2] m0: scored\n[2/2] m1: scored\n"
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    evaluate_folder(folder, config, Progress())
+    shown = capsys.readouterr().err
+    assert " 50%|" in shown and "1 of 2" in shown and "window" not in shown and "\x1b[A" not in shown
+    evaluate_folder(folder, config, QUIET)
+    assert capsys.readouterr().err == ""
 
 
 def test_detections_of_unknown_origin_take_the_only_truth(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 import pytest
 
 from pipeline.evaluate.tables import OWN_NAME, RatioRow, ScoreReport, as_markdown, verdict
+from pipeline.score_words import coverage_words
 from pipeline.scoring.scores import ScoreRow
 
 
@@ -31,6 +32,11 @@ def test_the_best_rival_is_the_one_that_counts() -> None:
 def test_a_region_that_does_not_hold_its_share_is_called_so(coverage: float, judged: str) -> None:
     (sentence,) = verdict(report(coverage))
     assert sentence == f"Future: the 90 % region holds {100 * coverage:.0f} % of the truth: {judged}."
+
+
+def test_that_a_region_is_wrong_is_not_said_of_what_may_be_chance() -> None:
+    assert coverage_words(0.97, 0.88, 1.0) == "it is too wide, which may be chance"
+    assert coverage_words(0.97, 0.95, 1.0) == "it is too wide" and coverage_words(0.89, 0.8, 0.95) == "as it should"
 
 
 def test_it_comes_first_and_says_nothing_where_nothing_was_scored() -> None:

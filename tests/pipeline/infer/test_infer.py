@@ -28,7 +28,7 @@ from pipeline.infer.draws import draw_windows
 from pipeline.infer.stage import infer
 from pipeline.manifest import StageResult, read_manifest
 from pipeline.obstacle_file import read_obstacles
-from pipeline.progress import Progress
+from pipeline.progress import Doing, Progress, RelayedProgress
 from pipeline.tables import Frame, read_table, write_table
 from pipeline.weights import save_checkpoint
 from pipeline.windows import build_windows
@@ -275,6 +275,18 @@ def test_what_takes_long_says_how_long(
     monkeypatch.setattr(writing, "_LONG_S", -1.0)
     infer(mission(tmp_path), CONFIG, Progress(), num_threads=1)
     assert "infer: 5 windows, about 0 min by the first ones" in capsys.readouterr().err
+
+
+def test_fitting_is_a_part_of_what_is_shown(tmp_path: Path) -> None:
+    told: list[object] = []
+    weights = checkpoint(tmp_path)
+    infer(mission(tmp_path), dataclasses.replace(CONFIG, checkpoint=str(weights)), RelayedProgress(tell=told.append))
+    shares = [share for share in told if isinstance(share, float)]
+    drawn = next(number for number, one in enumerate(told) if one == Doing("infer 5 of 5 windows"))
+    fitted = [share for share in told[:drawn] if isinstance(share, float)]
+    assert shares == sorted(shares) and shares[-1] == 1.0 and told[0] == Doing("infer: getting ready")
+    # two agents in five windows: what is fitted is about as much as what is drawn
+    assert len(fitted) >= 3 and 0.25 < fitted[2] < 0.5 and Doing("infer: testing on detections held back") in told
 
 
 def test_samples_that_are_not_finite_are_replaced(tmp_path: Path) -> None:

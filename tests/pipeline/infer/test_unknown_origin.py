@@ -169,7 +169,7 @@ def test_how_far_telling_apart_is_comes_before_the_windows(tmp_path: Path) -> No
     shares = [share for share in told if isinstance(share, float)]
     assert shares == sorted(shares) and shares[-1] == 1.0
     apart = next(number for number, one in enumerate(told) if isinstance(one, Doing) and "tell apart" in one)
-    windows = next(number for number, one in enumerate(told) if isinstance(one, Doing) and one.startswith("infer"))
+    windows = next(number for number, one in enumerate(told) if isinstance(one, Doing) and one.startswith("infer: fit"))
     assert apart < windows
     before = [share for share in told[:windows] if isinstance(share, float)]
     assert len(before) > 10 and before[-1] == pytest.approx(0.4)

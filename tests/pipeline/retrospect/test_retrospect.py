@@ -23,7 +23,7 @@ from pipeline.infer.stage import infer
 from pipeline.manifest import StageResult, check_chain
 from pipeline.obstacle_file import read_obstacles
 from pipeline.pasts import PASTS_NAME, read_pasts
-from pipeline.progress import Progress
+from pipeline.progress import Progress, RelayedProgress
 from pipeline.retrospect.config import RetrospectConfig
 from pipeline.retrospect.stage import retrospect
 from pipeline.stories import MISSION_NAME, read_stories
@@ -50,6 +50,13 @@ def detections() -> pa.Table:
     ]  # fmt: skip
     rows.sort(key=lambda row: (row["time_ns"], row["agent_id"]))
     return pa.Table.from_pylist(rows, schema=DETECTIONS)
+
+
+def test_how_far_it_is_is_told_agent_by_agent(tmp_path: Path) -> None:
+    told: list[object] = []
+    retrospect(mission(tmp_path), CONFIG, RelayedProgress(tell=told.append), num_threads=2)
+    shares = [share for share in told if isinstance(share, float)]
+    assert shares == pytest.approx([number / 6 for number in range(1, 7)])  # each agent drawn, and mended
 
 
 def mission(parent: Path, obstacles: tuple[dict[str, object], ...] = (), config: InferConfig = INFER) -> Path:
