@@ -124,7 +124,8 @@ class Bank:
         rows, seeds = active_rows(windows)
         floor_m = FLOOR_STEPS * self._speed() * windows.step_s
         rows = with_floor(rows, self.noise_steps * self.length_m(windows.step_s))
-        evidence = model_evidence(self, windows) if evidence is None else evidence
+        if evidence is None:  # one model alone is the likeliest whatever it says
+            evidence = torch.zeros(len(rows.time_s), 1) if len(self.models) == 1 else model_evidence(self, windows)
         log_posterior = self.temper * evidence + self._log_weight()
         parts = []
         nodes = with_floor(rows, floor_m)

@@ -84,13 +84,14 @@ def filter_from(models: MotionModels, nodes: Nodes, mean: Tensor, covariance: Te
     matrix, noise = transition(models, duration)
     log_likelihood = torch.zeros(num_rows, dtype=torch.float64)
     means, covariances = [], []
+    is_any = nodes.is_observed.any(0).tolist()
     for m in range(num_nodes):
         if m:
             step = matrix[:, m]
             mean = (step @ mean[..., None])[..., 0]
             covariance = step @ covariance @ step.mT + noise[:, m]
         observed = nodes.is_observed[:, m]
-        if observed.any():
+        if is_any[m]:
             mean, covariance, gained = _update(mean, covariance, nodes.position_m[:, m], nodes.covariance_m2[:, m], observed)
             log_likelihood = log_likelihood + gained
         means.append(mean)
@@ -119,7 +120,7 @@ def _update(
     innovation_cov = covariance[:, :2, :2] + noise_m2
     a, b, d = innovation_cov[:, 0, 0], innovation_cov[:, 0, 1], innovation_cov[:, 1, 1]
     determinant = a * d - b * b
-    inverse = torch.stack([torch.stack([d, -b], -1), torch.stack([-b, a], -1)], -2) / determinant[:, None, None]
+    inverse = torch.stack([d, -b, -b, a], -1).view(-1, 2, 2) / determinant[:, None, None]
     cross = covariance[:, :, :2]
     gain = cross @ inverse * observed[:, None, None]
     innovation = position_m - mean[:, :2]
@@ -180,8 +181,9 @@ def draw(backward: Backward, rows: Tensor, normal: Tensor) -> Tensor:
     states = [state]
     # the noise of all nodes in one product: only the recursion itself is sequential
     kick = (backward.root[rows] @ normal[:, :-1, :, None])[..., 0] + backward.offset[rows]
-    gain = backward.gain[rows]
-    for m in range(gain.shape[1] - 1, -1, -1):
-        state = (gain[:, m] @ state[..., None])[..., 0] + kick[:, m]
+    # node by node in memory, as it is read: nearly twice as fast
+    gain, kicks = backward.gain.transpose(0, 1).contiguous(), kick.transpose(0, 1).contiguous()
+    for m in range(len(gain) - 1, -1, -1):
+        state = torch.bmm(gain[m][rows], state[..., None])[..., 0] + kicks[m]
         states.append(state)
     return torch.stack(states[::-1], 1)

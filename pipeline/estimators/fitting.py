@@ -30,18 +30,27 @@ _MOST_WINDOWS = 8
 
 @dataclass(frozen=True, eq=False)
 class FittingData:
-    """The detections of a log, as a table, as windows and as stretches [R, 1, N]."""
+    """The detections of a log, as a table, as windows and as stretches [R, 1, N].
+
+    told_bank  what `BankPool.about` said of the bank that was fitted to the same log, grid and windows, where that is known:
+               it is not found again
+    """
 
     detections: pa.Table
     grid: Grid
     windows: MissionWindows
     tracks: Detections
     default_sigma_m: float
+    told_bank: Mapping[str, Any] | None = None
 
     @staticmethod
-    def of(detections: pa.Table, grid: Grid, windows: MissionWindows, default_sigma_m: float = 0.0) -> "FittingData":
+    def of(
+        detections: pa.Table, grid: Grid, windows: MissionWindows, default_sigma_m: float = 0.0,
+        told_bank: Mapping[str, Any] | None = None,
+    ) -> "FittingData":  # fmt: skip
         """The data with its stretches cut."""
-        return FittingData(detections, grid, windows, fit_tracks(detections, grid, default_sigma_m), default_sigma_m)
+        tracks = fit_tracks(detections, grid, default_sigma_m)
+        return FittingData(detections, grid, windows, tracks, default_sigma_m, told_bank)
 
     def fitted_heights(self, told: Mapping[str, Any] | None = None) -> HeightBank:
         """The bank of height fitted to the log, which has heights; as is `told` of the same log and grid, if it is."""
@@ -59,7 +68,8 @@ class FittingData:
 
     @functools.cached_property
     def _pool(self) -> BankPool:
-        return pool_by_hindsight(self._bank, *self.tests)
+        pool = None if self.told_bank is None else pool_as_told(self._bank, self.told_bank)
+        return pool or pool_by_hindsight(self._bank, *self.tests)
 
     @functools.cached_property
     def _bank(self) -> Bank:

@@ -25,10 +25,11 @@ from pipeline.evaluate.tables import OWN_NAME, ScoredMission, as_csv, as_json, a
 from pipeline.evaluate.whole import WholeCells, score_whole
 from pipeline.files import write_atomic
 from pipeline.forecast.stage import ForecastConfig, evaluate_forecasts
-from pipeline.manifest import StageResult, check_chain, manifest_path, run_stage
+from pipeline.manifest import StageResult, check_chain, manifest_path, read_manifest, run_stage
 from pipeline.missions import is_mission_directory
 from pipeline.obstacle_file import OBSTACLES_NAME
 from pipeline.progress import Doing, Progress, RelayedProgress, Told
+from pipeline.provenance import versions
 from pipeline.results import read_hypothesis_tables
 from pipeline.scoring.case import LABELS_NAME, Case, collision_test, mission_obstacles, read_case
 from pipeline.scoring.motion import MotionLaws, true_motion
@@ -164,7 +165,7 @@ def score_mission(directory: Path, config: EvaluateConfig, progress: Progress) -
     stored = read_hypothesis_tables(directory)
     case = read_case(directory, stored, config.max_truth_gap_s, config.gospa_cutoff_m, config.seed)
     windows, scored, num_hypotheses = case.windows, case.scored, case.num_hypotheses
-    fitting = _fitting(case, config.seed)
+    fitting = _fitting(case, config.seed, directory)
     obstacles = mission_obstacles(directory)
     collides = collision_test(obstacles, windows)
     truth = true_motion(scored, case.truth_m, case.is_known)
@@ -237,10 +238,21 @@ def _collision_share(collides: IsInside | None, case: Case) -> float | None:
     return float(hit[case.is_known].double().mean()) if bool(case.is_known.any()) else 0.0
 
 
-def _fitting(case: Case, seed: int) -> FittingData:
+def _fitting(case: Case, seed: int, directory: Path) -> FittingData:
     """What rivals are fitted to."""
     windows = build_windows(case.detections, case.grid, seed, case.default_sigma_m) if case.is_matched else case.windows
-    return FittingData.of(case.detections, case.grid, windows, case.default_sigma_m)
+    return FittingData.of(case.detections, case.grid, windows, case.default_sigma_m, _told_bank(directory, seed))
+
+
+def _told_bank(directory: Path, seed: int) -> Mapping[str, Any] | None:
+    """What infer said of the bank that it fitted, where the same program would find the same again; None elsewhere."""
+    manifest = read_manifest("infer", directory) or {}
+    config, summary = manifest.get("config"), manifest.get("summary")
+    if not isinstance(config, dict) or not isinstance(summary, dict):
+        return None
+    is_same = config.get("seed") == seed and manifest.get("versions") == versions()
+    found = summary.get("bank") if is_same else None
+    return found if isinstance(found, dict) else None
 
 
 def _scorer(case: Case) -> JointScorer:

@@ -17,7 +17,10 @@ from cadence.baselines.interpolation import GapLaw, Hold
 from cadence.errors import ConfigError, InputError
 from cadence.types import Detections, HypothesisSet, WindowBatch
 from pipeline.config import read_config
-from pipeline.evaluate.stage import EvaluateConfig, evaluate, evaluate_folder, score_mission
+from pipeline.evaluate.stage import EvaluateConfig, _told_bank, evaluate, evaluate_folder, score_mission
+from pipeline.grids import GridConfig
+from pipeline.infer.config import InferConfig
+from pipeline.infer.stage import infer
 from pipeline.progress import Progress
 from pipeline.scoring.scores import METRICS, Cells, compare, energy_ratio, groups_of, score_cells, score_in_chunks, summarise
 from pipeline.tables import Frame, read_table, write_table
@@ -324,3 +327,22 @@ def test_config_names_the_known_rivals() -> None:
 def test_fixture_has_its_origin_where_the_tables_say(mission: Path) -> None:
     cells = score_mission(mission, EvaluateConfig(rivals=()), QUIET).cells["cadence"]
     assert cells.step.min() >= -ORIGIN_INDEX and cells.step.max() == 32
+
+
+def test_the_bank_that_infer_fitted_is_the_rival_and_is_not_fitted_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    directory = build_mission(tmp_path)
+    grid = GridConfig(step_s=1.0, history_steps=16, horizon_steps=8, stride_steps=32)
+    infer(directory, InferConfig(num_hypotheses=4, checkpoint="none", grid=grid), QUIET)
+    config = EvaluateConfig(rivals=("bank",))
+    with monkeypatch.context() as patch:
+        patch.setattr("pipeline.evaluate.stage._told_bank", lambda *_: None)
+        anew = score_mission(directory, config, QUIET).cells["bank"]
+    with monkeypatch.context() as patch:
+        patch.setattr("pipeline.estimators.fitting.pool_by_hindsight", lambda *_: pytest.fail("fitted again"))
+        np.testing.assert_array_equal(score_mission(directory, config, QUIET).cells["bank"].value, anew.value)
+    # another seed has other windows, and another program may find another bank
+    assert _told_bank(directory, 0) is not None and _told_bank(directory, 1) is None
+    monkeypatch.setattr("pipeline.evaluate.stage.versions", lambda: {"cadence": "another"})
+    assert _told_bank(directory, 0) is None
