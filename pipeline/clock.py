@@ -53,7 +53,7 @@ class Clock:
         unit = 10 ** (9 - decimals)
         if self.is_calendar:
             seconds, rest = divmod(time_ns // unit, 10**decimals)
-            pattern = "%H:%M:%S" if self._day(self.start_ns) == self._day(self.end_ns) else "%m-%d %H:%M:%S"
+            pattern = "%H:%M:%S" if self._day(self.start_ns) == self._day(self.end_ns) else "%d %b %H:%M:%S"
             text = datetime.fromtimestamp(seconds, UTC).strftime(pattern)
         else:
             ticks = (time_ns - self.start_ns) // unit

@@ -24,7 +24,19 @@ METRICS: Final[Mapping[str, str]] = {
 mean distance of one hypothesis, and the share of the truth that lies in the region of 90 % of the weight (90 % is right)."""
 
 
+SCORE_LEGEND: Final = (
+    "energy score: how far all hypotheses together are from the truth, less is better; mean error: one of them; "
+    "of the truth 90 % should lie in the 90 % region"
+)
+"""The same for people."""
+
 _RIGHT = 0.9
+
+
+def away_words(ratio: float) -> str:
+    """`12 % below that` of a score that is .88 of another."""
+    percent = round(100 * abs(1 - ratio))
+    return f"{percent} % {'below' if ratio < 1 else 'above'} that" if percent else "within half a per cent of that"
 
 
 def estimator_words(name: str) -> str:

@@ -109,7 +109,7 @@ def _where(known: Known, question: Question, agent: int) -> Answer | None:
     parts, shares = part_words(most.shape, position_m, known.stories.weight)
     sentence = (
         f"At {known.clock.moment(at_ns)} {name} was, with 90 %, within {area_words(most.area_m2)} about "
-        f"{place_words(known.frame, found.centre_m)}{parts}{there}."
+        f"{place_words(known.frame, found.centre_m, found.spread_m)}{parts}{there}."
     )
     sizes = {
         f"{100 * area.level:g}": {"area_m2": area.area_m2, "low_m2": area.low_m2, "high_m2": area.high_m2}
@@ -151,7 +151,7 @@ def _arrive(known: Known, question: Question, agent: int) -> Answer:
     words = [f"{name} arrived in {_called(question)} {_during(known, question, span)}: {percent(found.arrived)}"]
     words += [f"at {_at(known, found.arrived_s)}"] if found.arrived_s else []
     if found.place_m is not None and found.place_spread_m is not None:
-        words += [f"over its border at {place_words(known.frame, found.place_m)}, give or take {metres(found.place_spread_m)}"]
+        words += [f"over its border {_about(known, found.place_m, found.place_spread_m)}"]
     words += [f"it was there from the beginning: {percent(found.was_there)}"] if found.was_there.value > 0 else []
     told = {
         "arrived": numbers(found.arrived), "was_there": numbers(found.was_there),
@@ -237,7 +237,7 @@ def _meeting(known: Known, question: Question, one: int, other: int, span: tuple
     if found.met_s is not None and found.lasted_s is not None:
         words += [f"at {_at(known, found.met_s)}", f"for {span_words(found.lasted_s)}"]
     if found.place_m is not None and found.place_spread_m is not None:
-        words += [f"at {place_words(known.frame, found.place_m)}, give or take {metres(found.place_spread_m)}"]
+        words += [_about(known, found.place_m, found.place_spread_m)]
     if found.nearest_m is not None:
         near = found.nearest_m
         words += [f"nearest {metres(near.median)} ({metres(near.low)} to {metres(near.high)})"]
@@ -268,6 +268,10 @@ def _answer(
 def _at(known: Known, when: Law | None) -> str:
     assert when is not None
     return moment_words(known.clock, known.start_ns, when)
+
+
+def _about(known: Known, place_m: tuple[float, float], spread_m: float) -> str:
+    return f"at {place_words(known.frame, place_m, spread_m)}, give or take {metres(spread_m)}"
 
 
 def _called(question: Question) -> str:

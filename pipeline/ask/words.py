@@ -12,6 +12,9 @@ from pipeline.frames import to_geodetic
 from pipeline.lengths import three_digits
 from pipeline.tables import Frame
 
+_FINE_M = 50.0
+"""What is known more exactly than this has more digits than fit ten metres."""
+
 
 def percent(found: Probability) -> str:
     """`73 % (68 to 78 %)`, the 95 % interval of more stories; `less than 1 %` where it is so in none of them."""
@@ -41,12 +44,14 @@ def span_words(found: Law) -> str:
     return median if low == median == high else f"{median} ({low} to {high})"
 
 
-def place_words(frame: Frame, place_m: tuple[float, float]) -> str:
-    """`50.7612° N, 1.2033° W`, or metres where the log is not georeferenced."""
+def place_words(frame: Frame, place_m: tuple[float, float], within_m: float = math.inf) -> str:
+    """`50.7612° N, 1.2033° W`, or metres where the log is not georeferenced; with more digits where it is known `within_m`."""
     if not frame.is_georeferenced:
-        return f"x {place_m[0]:,.0f} m, y {place_m[1]:,.0f} m"
+        digits = 0 if within_m > _FINE_M / 10 else 2
+        return f"x {place_m[0]:,.{digits}f} m, y {place_m[1]:,.{digits}f} m"
     latitude, longitude = (float(found[0]) for found in to_geodetic(frame, np.array([place_m[0]]), np.array([place_m[1]])))
-    return f"{abs(latitude):.4f}° {'S' if latitude < 0 else 'N'}, {abs(longitude):.4f}° {'W' if longitude < 0 else 'E'}"
+    north, east, digits = "S" if latitude < 0 else "N", "W" if longitude < 0 else "E", 4 if within_m > _FINE_M else 6
+    return f"{abs(latitude):.{digits}f}° {north}, {abs(longitude):.{digits}f}° {east}"
 
 
 def area_words(area_m2: float) -> str:

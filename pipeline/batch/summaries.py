@@ -11,7 +11,7 @@ from pipeline.batch.outcome import LogOutcome, Status
 from pipeline.counted import counted
 from pipeline.manifest import StageResult
 from pipeline.place_words import place_words
-from pipeline.score_words import METRICS, estimator_words, value_words
+from pipeline.score_words import METRICS, SCORE_LEGEND, estimator_words, value_words
 from pipeline.stores.urls import shown
 from pipeline.suspicions import few, suspicions_in
 
@@ -46,7 +46,8 @@ def stage_summary(result: StageResult) -> str:
     numbers = [_named(name, value) for name, value in result.summary.items() if type(value) in (int, float) and value]
     lines = [f"{result.stage}: {result.status}", *([f"  {', '.join(numbers)}"] if numbers else [])]
     lines += [f"  {line}" for line in result.summary.get("verdict", ())]
-    lines += score_lines(result.summary.get("scores", ()))
+    if scores := result.summary.get("scores", ()):
+        lines += [*score_lines(scores), f"  {SCORE_LEGEND}"]
     lines += [f"  suspected {line}" for line in few(suspicions_in(result.summary))]
     lines += [f"  note: {line}" for line in result.summary.get("remarks", ())]
     return "\n".join(lines + [f"  {path}" for path in result.outputs])

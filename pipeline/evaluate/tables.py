@@ -16,7 +16,7 @@ from pipeline.evaluate.maps import MapCells, map_rows
 from pipeline.evaluate.markdown import line, ordered, value, with_interval
 from pipeline.evaluate.whole import WholeCells, whole_rows, whole_table, whole_verdict
 from pipeline.plain_rows import rows_as_csv, without_nan
-from pipeline.score_words import coverage_words, estimator_words
+from pipeline.score_words import away_words, coverage_words, estimator_words
 from pipeline.scoring.motion import MotionLaws, MotionSample, motion_rows
 from pipeline.scoring.scores import PARTS, Cells, ScoreRow, energy_ratio, groups_of, summarise
 
@@ -233,9 +233,8 @@ def _verdict(report: ScoreReport, part: str) -> list[str]:
     held = next((row for row in own if row.metric == "coverage_90"), None)
     sentences = []
     if best is not None:
-        rival, away = estimator_words(best.rival), f"{abs(1 - best.value):.0%}".replace("%", " %")
-        apart = f"{away} {'below' if best.value < 1 else 'above'} that of the best rival ({rival})"
         is_certain = best.high < 1 or best.low > 1
+        apart = f"{away_words(best.value)} of the best rival ({estimator_words(best.rival)})"
         sentences.append(f"the energy score is {apart}{'' if is_certain else ', which may be chance'};")
     if held is not None and math.isfinite(held.value):
         judged = coverage_words(held.value, held.low, held.high)

@@ -15,7 +15,7 @@ from cadence import metrics
 from cadence.arrays import Bools, Float64s, Int64s
 from cadence.types import HypothesisSet
 from pipeline.evaluate.markdown import line, value, with_interval
-from pipeline.score_words import coverage_words, estimator_words
+from pipeline.score_words import away_words, coverage_words, estimator_words
 from pipeline.scoring.case import Case
 from pipeline.scoring.scores import Cells, Draw, ScoreRow, groups_of
 from pipeline.stories import MissionStories
@@ -193,10 +193,10 @@ def whole_verdict(rows: Sequence[ScoreRow]) -> Iterator[str]:
     ratio, held = found.get(_RATIO), found.get("coverage_90")
     if ratio is None or held is None:
         return
-    away = f"{100 * abs(1 - ratio.value):.0f} % {'below' if ratio.value < 1 else 'above'}"
     chance = "" if ratio.high < 1 or ratio.low > 1 else ", which may be chance"
     words, judged = estimator_words(WHOLE_NAME), coverage_words(held.value, held.low, held.high)
     yield (
-        f"{words[:1].upper()}{words[1:]}: on the steps between first and last detection the energy score is {away} that of the "
-        f"windows{chance}; the 90 % region holds {100 * held.value:.0f} % of the truth: {judged}."
+        f"{words[:1].upper()}{words[1:]}: on the steps between first and last detection the energy score is "
+        f"{away_words(ratio.value)} of the windows{chance}; the 90 % region holds {100 * held.value:.0f} % of the truth: "
+        f"{judged}."
     )

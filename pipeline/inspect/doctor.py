@@ -43,6 +43,7 @@ _LEFT_OUT = {
 _ADVICE = {
     "copy": "If there is another copy of the recording, use that one: what is lost here may be whole there.",
     "as it is": "`cadence run` works on the damaged log as it is: it takes what is sound, and lost spans are gaps.",
+    "nothing": "Say which channel holds detections: `cadence info LOG` prints the lines for a file of settings.",
     "joined": "Keep each recording as a file of its own: most tools find only one of those that were joined to one file.",
     "recorder": "Let the recorder write checksums and an index (most do unless told otherwise), and end it in good order.",
     "again": "Every message is there: copy the file again if it was copied, else let its recorder end it in good order.",
@@ -162,6 +163,7 @@ def _of(name: str, log: MissionLog) -> Diagnosis:
     reasons = {
         "copy": not health.is_complete,
         "as it is": not health.is_complete and not no_use,
+        "nothing": bool(no_use),
         "joined": is_joined,
         "recorder": bool(container),
         "again": bool(health.problems and health.is_complete and not is_joined),

@@ -65,6 +65,10 @@ class SuggestedMapping:
         }
         for comment, sources in comments.items():
             blocks += ["# " + f"{comment}\n{_entry('detections', each)}".replace("\n", "\n# ") for each in sources]
+        if not self.detections and not self.truth:
+            seen = [replace(each, topic=each.topic.replace("{sensor}", "{agent}")) for each in self.poses]
+            told = "if it tells where a target is, and not where a sensor was, say instead"
+            blocks += ["# " + f"{told}\n{_entry('detections', each)}".replace("\n", "\n# ") for each in seen]
         if blocks and not self.detections:
             blocks.append("# to make sparse detections out of the dense channel:\n# [extract.thinning]\n# enabled = true")
         return "\n\n".join(blocks) + ("\n" if blocks else "")

@@ -5,6 +5,8 @@ from typing import Any
 
 from pipeline.accuracies import in_words
 from pipeline.clock import Clock, duration
+from pipeline.height_words import height_words
+from pipeline.lengths import three_digits
 from pipeline.logs.reader import Health
 from pipeline.measurement_words import measurement_words
 from pipeline.report.markup import flatten, label, pairs, section, table, text
@@ -19,6 +21,17 @@ FACTS = {
     "has_checksums": "checksums, to notice changed bytes",
 }
 """Facts of the catalogue's health in words."""
+
+CHANNEL = {
+    "topic": "topic",
+    "schema_name": "type",
+    "encoding": "encoding",
+    "num_messages": "messages",
+    "mean_rate_hz": "rate (Hz)",
+    "frame_id": "frame",
+    "reason": "why it cannot be decoded",
+}
+"""What is told of channels of the catalogue, in words."""
 
 EXTRACTED = {
     "num_agents": "agents named",
@@ -77,11 +90,13 @@ def _extraction(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
         rows.append(("accuracy, where none is stated", text(line)))
     if words := measurement_words(summary.get("measurements") or {}):
         rows.append(("bearings and ranges", text(words)))
+    if height := summary.get("height"):
+        rows.append(("heights", text(height_words(height).removeprefix("heights are "))))
     unused = summary.get("unused") or {}
     rows += [("may hold detections, not used", text(f"{channel}: {why}")) for channel, why in unused.items()]
     # Other parts of the page tell of these already.
     known = {*LEFT_OUT, *EXTRACTED, "lost_spans_ns", "is_complete", "frame", "suspicions", "unused"}
-    known |= {"accuracy", "taken", "measurements"}
+    known |= {"accuracy", "taken", "measurements", "height"}
     flat = dict(flatten(summary))
     found = [(text(words), text(flat[key])) for key, words in EXTRACTED.items() if flat.get(key)]
     # What else was counted is told where there was any.
@@ -119,13 +134,15 @@ def _channels(mission: Mission) -> str:
     channels = mission.catalogue.channels
     if not channels:
         return ""
-    heads = ("topic", "schema_name", "encoding", "num_messages", "mean_rate_hz", "frame_id", "reason")
-    rows = [[text(getattr(channel, key)) for key in heads] for channel in channels[:MAX_CHANNELS]]
+    rows = [
+        [text("–" if value is None else three_digits(value) if isinstance(value, float) else value) for value in values]
+        for values in ([getattr(channel, key) for key in CHANNEL] for channel in channels[:MAX_CHANNELS])
+    ]
     rest = (
         f'<p class="note">{len(channels) - MAX_CHANNELS} more channels are in catalogue.json.</p>'
         if len(channels) > MAX_CHANNELS
         else ""
     )
-    numeric = [heads.index(key) for key in ("num_messages", "mean_rate_hz")]
-    body = table([key.replace("_", " ") for key in heads], rows, numeric)
+    numeric = [list(CHANNEL).index(key) for key in ("num_messages", "mean_rate_hz")]
+    body = table(list(CHANNEL.values()), rows, numeric)
     return f"<details><summary>{len(channels)} channel{'s' if len(channels) > 1 else ''}</summary>{body}{rest}</details>"

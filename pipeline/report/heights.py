@@ -61,7 +61,7 @@ def height_section(mission: Mission) -> str:
 
 
 def _row(mission: Mission, name: str, axis: TimeAxis) -> str:
-    stretches = _stretches(mission.stored.windows, name)
+    stretches = _stretches(mission.stored.windows, name, mission.start_ns)
     seen = mission.detections.of(mission.agents.index(name))
     known = np.isfinite(seen.height_m) if seen.height_m is not None else np.zeros(len(seen), bool)
     seen_m = seen.height_m[known] if seen.height_m is not None else np.zeros(0)
@@ -77,7 +77,7 @@ def _row(mission: Mission, name: str, axis: TimeAxis) -> str:
     for value in (middle - half, middle + half):
         y = float(pixels(np.array(value)))
         parts.append(f'<path class="grid" d="M{LABEL_WIDTH} {y:.1f} H{CHART_WIDTH - MARGIN_RIGHT}"/>')
-        parts.append(f'<text class="unit" x="{LABEL_WIDTH - 6}" y="{y + 4:.1f}" text-anchor="end">{value:,.0f} m</text>')
+        parts.append(f'<text class="unit" x="{LABEL_WIDTH - 6}" y="{y + 4:.1f}" text-anchor="end">{round(value):,} m</text>')
     for stretch in stretches:
         x, (bottom, median, top) = axis.pixels(stretch.time_ns), pixels(stretch.height_m)
         kind = "future" if stretch.is_future else "past"
@@ -93,14 +93,14 @@ def _points(x: Float64s, y: Float64s) -> str:
     return " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(x.tolist(), y.tolist(), strict=True))
 
 
-def _stretches(windows: Sequence[WindowHypotheses], name: str) -> list[_Stretch]:
-    """Each moment once: from the origin before to a window's own, and after the last one its future."""
-    found, before_ns = [], None
+def _stretches(windows: Sequence[WindowHypotheses], name: str, start_ns: int) -> list[_Stretch]:
+    """Each moment from the log's start on once: from the origin before to a window's own, and after the last one its future."""
+    found, before_ns = [], start_ns
     own = [(w, a) for w in windows for a in w.agents if a.agent_id == name and a.height_m is not None]
     for number, (window, agent) in enumerate(own):
         steps = np.arange(window.num_steps) - window.origin_index
         time_ns = window.origin_ns + steps * window.step_ns
-        is_own = (steps <= 0) & (time_ns >= (window.start_ns if before_ns is None else before_ns))
+        is_own = (steps <= 0) & (time_ns >= before_ns)
         found.append(_Stretch(time_ns[is_own], _quantiles(window, agent)[:, is_own], False))
         if number == len(own) - 1 and (steps > 0).any():
             found.append(_Stretch(time_ns[steps >= 0], _quantiles(window, agent)[:, steps >= 0], True))

@@ -10,6 +10,7 @@ from cadence.arrays import Float64s
 from cadence.evidence.footprints import detection_probability
 from cadence.evidence.silence import Looks
 from pipeline.clock import Clock
+from pipeline.counted import counted
 from pipeline.lengths import metres
 from pipeline.looks import Footprint
 from pipeline.report.maps import MAP_HEIGHT, MAP_WIDTH, View, north_arrow, scale_bar
@@ -42,7 +43,7 @@ def silence_section(mission: Mission) -> str:
         figures.append(f"<figure>{drawing}<figcaption>{text(words)}</figcaption></figure>")
     lead = (
         "Where sensors looked in each quarter of the mission: the darker, the more of the time a target there would have been "
-        "detected. Hypotheses that were there unseen count less. "
+        "detected. "
     )
     return section(
         "Where sensors looked", f'<div class="moments">{"".join(figures)}</div>{_table(mission)}', lead + _believed(mission)
@@ -56,13 +57,17 @@ def _believed(mission: Mission) -> str:
         return "None of it was used."
     exponent, num_tests = float(silence.get("exponent") or 0.0), int(silence.get("num_tests") or 0)
     ratio = (silence.get("ratios") or {}).get(f"{exponent:g}")
-    how, told = "as too few withheld detections can tell, or as is set", ""
-    if ratio is not None:
-        how = f"as {num_tests} withheld detections advise"
-        told = f"; weighed by it, hypotheses miss them by {float(ratio):.2f} of what they did"
+    stated = ((mission.manifests["infer"].get("config") or {}).get("evidence") or {}).get("exponent")
     if exponent == 0.0:
-        return f"It is not believed at all, {how}."
-    return f"It counts {exponent:g} of what independent looks would say, {how}{told}."
+        why = "as is set (infer.evidence.exponent)"
+        if stated is None:
+            why = f"as hypotheses weighed by it miss {counted(num_tests, 'withheld detection')} by more than without it"
+        return f"That a target was not detected there is not used, {why}."
+    how, told = "as too few withheld detections can tell" if stated is None else "as is set", ""
+    if ratio is not None:
+        how = f"as {counted(num_tests, 'withheld detection')} advise{'s' if num_tests == 1 else ''}"
+        told = f"; weighed by it, hypotheses miss them by {float(ratio):.2f} of what they did"
+    return f"Hypotheses that were there unseen count less: by {exponent:g} of what independent looks would say, {how}{told}."
 
 
 def _places(mission: Mission) -> Float64s:
@@ -138,11 +143,11 @@ def _table(mission: Mission) -> str:
         rows.append(
             (text(shown), _curve(footprint), text(rests + trust), f"{sum(len(some) for _, some in members):,}", f"{hits:,}")
         )
-    return table(("sensor", "P(detect) over distance", "known by", "looks", "detections"), rows[:40], (3, 4))
+    return table(("sensor", "how surely it detects, by distance", "known by", "looks", "detections"), rows[:40], (3, 4))
 
 
 def _curve(footprint: Footprint) -> str:
-    """P(detect) as a small drawing; of a fitted one both halves."""
+    """The chance of a detection as a small drawing; of a fitted one both halves."""
     curves = [footprint.curve(part) for part in range(len(footprint.curves))]
     reach = max(curve.reach for curve in curves)
     at = np.linspace(0.0, reach, 60)
@@ -151,7 +156,7 @@ def _curve(footprint: Footprint) -> str:
         points = " ".join(
             f"{_CURVE_WIDTH * x / reach:.1f},{_CURVE_HEIGHT * (1 - y) + 1:.1f}" for x, y in zip(at, curve(at), strict=True)
         )
-        lines.append(f'<polyline class="past mean" points="{points}"/>')
-    words = f"falls from {max(float(curve(at[:1])[0]) for curve in curves):.2f} to nothing at {metres(reach)}"
+        lines.append(f'<polyline class="past mean" fill="none" points="{points}"/>')
+    words = f"falls from {100 * max(float(curve(at[:1])[0]) for curve in curves):.0f} % to nothing at {metres(reach)}"
     opening = f'<svg width="{_CURVE_WIDTH}" height="{_CURVE_HEIGHT + 2}" role="img" aria-label="{text(words)}">'
     return f"{opening}{''.join(lines)}</svg><br><small>{text(words)}</small>"

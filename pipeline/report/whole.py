@@ -8,7 +8,7 @@ import numpy as np
 from cadence.arrays import Float64s
 from pipeline.report.maps import View, draw_line, draw_obstacle, north_arrow, scale_bar, simplify
 from pipeline.report.markup import legend, section
-from pipeline.report.mission import Mission
+from pipeline.report.mission import Mission, Points
 from pipeline.report.moving import moving_parts
 from pipeline.stories import MissionStories
 
@@ -67,12 +67,13 @@ def _tracks(found: MissionStories) -> Iterator[list[tuple[int, Float64s]]]:
 
 
 def _view(mission: Mission, lines_m: list[Float64s]) -> View:
-    """All but a few stray hypotheses, which must not shrink all others to a dot; detections as far as lines go."""
+    """All but a few stray hypotheses, which must not shrink all others to a dot; detections and truth as far as lines go."""
     joined = np.concatenate(lines_m)
     low, high = np.percentile(joined, [1, 99], axis=0)
-    seen_m = mission.detections.position_m
-    is_near = ((seen_m >= joined.min(axis=0)) & (seen_m <= joined.max(axis=0))).all(axis=1)
-    return View(np.concatenate([low[None], high[None], seen_m[is_near]]), 0.06, (_WIDTH, _HEIGHT))
+    known = [mission.detections, *([] if mission.truth is None else [_told_truth(mission)])]
+    known_m = np.concatenate([points.position_m for points in known])
+    is_near = ((known_m >= joined.min(axis=0)) & (known_m <= joined.max(axis=0))).all(axis=1)
+    return View(np.concatenate([low[None], high[None], known_m[is_near]]), 0.06, (_WIDTH, _HEIGHT))
 
 
 def _lines(tracks: list[list[tuple[int, Float64s]]], num_agents: int, view: View, max_vertices: float) -> tuple[int, list[str]]:
@@ -103,13 +104,18 @@ def _sensors(mission: Mission, view: View) -> Iterator[str]:
 
 
 def _truth(mission: Mission, view: View) -> Iterator[str]:
-    """As long as mission hypotheses last."""
-    if mission.truth is None or mission.stories is None:
+    if mission.truth is None:
         return
-    time_ns = mission.stories.time_ns
-    truth = mission.truth.between(int(time_ns[0]), int(time_ns[-1]))
+    truth = _told_truth(mission)
     for agent in np.unique(truth.owner).tolist():
         yield draw_line(view.pixels(truth.of(agent).position_m), "truth")
+
+
+def _told_truth(mission: Mission) -> Points:
+    """As long as mission hypotheses last."""
+    assert mission.truth is not None and mission.stories is not None
+    time_ns = mission.stories.time_ns
+    return mission.truth.between(int(time_ns[0]), int(time_ns[-1]))
 
 
 def _detections(mission: Mission, view: View) -> Iterator[str]:

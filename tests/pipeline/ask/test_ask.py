@@ -15,6 +15,7 @@ from PIL import Image
 import cli
 from cadence.errors import UsageError
 from pipeline import Question, open_mission
+from pipeline.ask.words import area_words, place_words
 from pipeline.frames import to_geodetic
 from pipeline.looks import Footprint, LookRows, write_looks
 from pipeline.tables import read_table, write_table
@@ -226,6 +227,13 @@ def test_bad_input_is_one_clear_line(placed, words, says, code, capsys):
     assert got == code, err
     if code:
         assert out == "" and err.count("\n") == 1 and err.startswith("cadence: error: ") and says in err
+
+
+def test_numbers_have_as_many_digits_as_mean_something():
+    assert [area_words(area) for area in (5.63, 12_345.0, 2.43e9)] == ["5.63 m²", "12,300 m²", "2,430 km²"]
+    assert place_words(FRAME, (-4.6, 1234.5)) == "x -5 m, y 1,234 m"
+    assert place_words(FRAME, (-4.6, 1234.5), 0.7) == "x -4.60 m, y 1,234.50 m"
+    assert place_words(GEOREFERENCED, (0.0, 0.0), 5.0).count(".") == 2 and len(place_words(GEOREFERENCED, (0.0, 0.0), 5.0)) > 24
 
 
 def test_several_missions_are_asked_and_what_is_none_is_left_out(directory, tmp_path, capsys):

@@ -21,6 +21,8 @@ def test_the_best_rival_is_the_one_that_counts() -> None:
     assert sentence == f"Future: {says}: as it should."
     (sentence,) = verdict(report(0.9, ("cv", 0.5, 0.4, 0.6), ("hold", 1.34, 1.1, 1.5)))
     assert "is 34 % above that of the best rival (stays where seen); the" in sentence
+    (sentence,) = verdict(report(0.9, ("cv", 0.997, 0.8, 1.1)))
+    assert "score is within half a per cent of that of the best rival (constant velocity), which may be chance" in sentence
     (sentence,) = verdict(report(0.9, ("cv", 0.95, 0.8, 1.1)))
     assert "5 % below that of the best rival (constant velocity), which may be chance; the" in sentence
 

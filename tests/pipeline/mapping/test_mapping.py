@@ -142,7 +142,8 @@ def test_toml_of_unknown_detections_and_of_dense_logs() -> None:
     assert '# latitude = "fixes[:].lat"\n# longitude = "fixes[:].lon"' in suggest_mapping([degrees]).to_toml()
     px4 = FakeChannel("/target", "px4_msgs/msg/Own", b"float32 x\nfloat32 y\n")
     assert '# x = "x"\n# y = "y"\n# frame_convention = "ned"' in suggest_mapping([px4]).to_toml()
-    assert "# [extract.thinning]" in suggest(("/cub1/pose", POSE)).to_toml()
+    dense = suggest(("/cub1/pose", POSE)).to_toml()
+    assert "# [extract.thinning]" in dense and '# [[extract.detections]]\n# topic = "/{agent}/pose"' in dense
     assert suggest(("/imu", "sensor_msgs/Imu")).to_toml() == ""
 
 

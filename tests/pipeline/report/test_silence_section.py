@@ -59,9 +59,13 @@ def test_the_section_tells_curves_and_belief():
     told = {"exponent": 0.6, "num_tests": 20, "ratios": {"0.6": 0.91}}
     page = silence_section(mission(told, *given))
     assert page.count('<svg class="map"') == 4 and page.count('class="covered"') > 20 and page.count('class="detection"') == 1
-    assert "counts 0.6 of what independent looks would say, as 20 withheld detections advise" in page and "0.91" in page
+    assert "count less: by 0.6 of what independent looks would say, as 20 withheld detections advise" in page and "0.91" in page
     assert "mast &lt;1&gt;" in page and "believed 0.80: it contradicts detections" in page
-    assert "fitted on 1,200 looks, 90 hits" in page and page.count("<polyline") == 3
+    assert (
+        "fitted on 1,200 looks, 90 hits" in page
+        and page.count("<polyline") == page.count('fill="none" points') == 3
+        and "from 0 %" not in page
+    )
     assert re.search(r'240</td><td class="number">3<', page)
 
 
@@ -69,7 +73,7 @@ def test_the_section_tells_curves_and_belief():
     ("told", "words"),
     [
         (None, "None of it was used"),
-        ({"exponent": 0.0, "num_tests": 9, "ratios": {}}, "not believed at all"),
+        ({"exponent": 0.0, "num_tests": 9, "ratios": {"0.3": 1.1}}, "is not used, as hypotheses weighed by it miss 9 withheld"),
         ({"exponent": 0.3, "num_tests": 2, "ratios": {}}, "as too few withheld detections can tell"),
     ],
 )

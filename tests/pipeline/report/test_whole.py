@@ -1,5 +1,6 @@
 """The map of the whole mission: what it draws, what it says, and results that have no mission hypotheses."""
 
+import dataclasses
 import json
 import re
 from pathlib import Path
@@ -13,7 +14,7 @@ from cadence.errors import InputError
 from cadence.stories import Stories
 from pipeline.progress import Progress
 from pipeline.report.config import ReportConfig
-from pipeline.report.mission import load_mission
+from pipeline.report.mission import Points, load_mission
 from pipeline.report.stage import report
 from pipeline.report.whole import whole_section
 from pipeline.stories import Block, MissionStories, seconds_since, write_stories
@@ -56,6 +57,14 @@ def test_thirty_stories_of_each_agent_are_drawn_where_they_are(tmp_path: Path) -
     assert section.count('class="obstacle"') >= 2 and lines(section, "truth") and lines(section, "way")
     assert section.partition("</svg>")[0].count('class="detection"') > 10
     assert ">T0</text>" in section and ">T1</text>" in section
+
+
+def test_truth_within_the_reach_of_hypotheses_is_not_cut_off(tmp_path: Path) -> None:
+    mission = load_mission(bent_mission(tmp_path, 1))
+    ends_m = np.array([[0.0, -3000.0], [0.0, 3000.0]])  # one step in a thousand is as far away
+    truth = Points(START_NS + np.array([0, STEP_NS]), np.array([0, 0]), ends_m)
+    (line,) = lines(whole_section(dataclasses.replace(mission, truth=truth), LARGE), "truth")
+    assert 0 < line[1, 1] < line[0, 1] < 460
 
 
 def test_it_is_the_first_map_and_says_what_it_is(tmp_path: Path) -> None:
