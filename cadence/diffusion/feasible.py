@@ -28,6 +28,10 @@ _MOST_SIGMAS = 3.0
 _CALMING_ROUNDS = 3
 """A way round an obstacle has corners, and a corner that is smoothed may touch the obstacle: in turns."""
 
+_HURRIES = 1.3
+"""A way round an obstacle makes steps longer. Tracks up to so many times as fast as is plausible are kept nevertheless: to draw
+others in their place halved what there was on some patrols, and those that went round were the first to go."""
+
 _LEAST_WEIGHT = 1e-3
 
 
@@ -95,8 +99,8 @@ class Feasibility:
 
         Returns:
             Positions, weight of each hypothesis of a row [R, K] — one that had to be moved by many sigmas counts
-            less — and which of them are to be kept [R, K]: those within all limits, or where there are none in a row, those
-            that are only faster than is plausible; none at all where every one breaks what was stated.
+            less — and which of them are to be kept [R, K]: those within all stated limits and not much faster than is
+            plausible, or where there are none in a row, those within the stated ones; none at all where every one breaks these.
         """
         agility = self._agility(length_m)
         if not self.keep_out.obstacles.count and self.longest_m is None and not agility.is_limited:
@@ -104,7 +108,7 @@ class Feasibility:
             return position_m, even, torch.ones_like(even, dtype=torch.bool)
         moved, is_feasible = self._within_limits(position_m, sigma_m, length_m, agility)
         if self.plausible_mps is not None:
-            is_plausible = is_feasible & ~exceeds(moved, float(self.plausible_mps.max()) * self.step_s)
+            is_plausible = is_feasible & ~exceeds(moved, _HURRIES * float(self.plausible_mps.max()) * self.step_s)
             is_feasible = torch.where(is_plausible.any(1, keepdim=True), is_plausible, is_feasible)
         shift = (moved - position_m).norm(dim=-1) / (sigma_m[:, None] + _PINNED_SHARE * length_m)
         log_weight = -0.5 * (shift**2).mean(-1)

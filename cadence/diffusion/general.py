@@ -74,7 +74,8 @@ class GeneralModel:
     sampler    "rotation", "ddim" or "dpmpp"
     num_steps  evaluations of the network for each hypothesis
     guidance   how constraints act: a speed limit, and the obstacles of the windows' context
-    top_speed  what the log's detections show of how fast its targets are at most; no track is faster
+    top_speed  what the log's detections show of how fast its targets are at most; no track is faster, but a little on ways
+               round obstacles
     is_smooth  what the network adds to a track of the bank is smoothed (`cadence.diffusion.transport`)
     share_past, share_future  share of the hypotheses that the network moves, up to the origin and after it; the others stay
                samples of the bank

@@ -231,3 +231,12 @@ def test_hypotheses_keep_the_top_speeds_that_the_log_makes_plausible() -> None:
     assert is_kept.all() and torch.equal(moved[:, :, PINNED], wild_m[:, :, PINNED])
     stated = Feasibility.of(WINDOWS, GuidanceConfig(max_speed_mps=1.85), top_mps).longest_m
     assert isinstance(stated, torch.Tensor) and stated.max() == 1.85
+
+
+@pytest.mark.parametrize("seen_mps", [1.1, 1.4, 1.6])
+def test_a_way_round_may_be_a_little_faster_than_is_plausible(seen_mps: float) -> None:
+    limits = dataclasses.replace(LIMITS, plausible_mps=TopSpeed(seen_mps).spread(NUM))
+    moved, _, is_kept = limits.finish(POSTERIOR.sample_m, POSTERIOR.sigma_m, LENGTH_M)
+    most_m = TopSpeed(seen_mps).spread(NUM).max()
+    assert torch.equal(is_kept, ~exceeds(moved, 1.3 * most_m))
+    assert (exceeds(moved, most_m) & is_kept).any() and not is_kept.all()
