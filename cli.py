@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import typer
-from typer.core import TyperGroup
+from typer.core import TyperArgument, TyperCommand, TyperGroup
 
 from cadence.errors import CadenceError, DeviceError, PartialInputError, UsageError
 from pipeline.batch.summaries import batch_summary, log_record, stage_exit_code, stage_summary, to_json
@@ -46,6 +46,9 @@ Log = Annotated[Path, typer.Argument(metavar="LOG", help="Mission log (MCAP).", 
 Logs = Annotated[
     list[str],
     typer.Argument(metavar="LOG", help="Mission logs (MCAP), folders, patterns or URLs of them.", show_default=False),
+]
+LocalLogs = Annotated[
+    list[str], typer.Argument(metavar="LOG", help="Mission logs (MCAP), folders or patterns of them.", show_default=False)
 ]
 Mission = Annotated[
     Path, typer.Argument(metavar="MISSION", help="Mission directory, as written by ingest or run.", show_default=False)
@@ -94,7 +97,7 @@ LogOut = Annotated[
 ViewTarget = Annotated[str, typer.Argument(metavar="LOG|RESULTS", help="A log, or what run made of one.", show_default=False)]
 ViewOut = Annotated[str, typer.Option("--out", metavar="DIR", help="Folder for the results of a log.")]
 Served = Annotated[bool, typer.Option("--serve", help="Serve the folder to this machine, and print the address.")]
-Port = Annotated[int, typer.Option(metavar="N", help="Port to serve at; 0: a free one.")]
+Port = Annotated[int, typer.Option(metavar="N", min=0, max=65535, help="Port to serve at; 0: a free one.")]
 TakeTo = Annotated[
     list[str] | None, typer.Option("--to", metavar="FORMATS", help="Formats for other programs, with commas; repeatable.")
 ]
@@ -147,7 +150,7 @@ def info(log: Log, as_json: Json = False) -> int:
 
 
 @app.command()
-def doctor(logs: Logs, quiet: Quiet = False, as_json: Json = False) -> int:
+def doctor(logs: LocalLogs, quiet: Quiet = False, as_json: Json = False) -> int:
     """Say what is wrong with a log, and what to do.
 
     Damage and lost time spans, index and checksums, clocks and gaps, channels that cannot be decoded, what `cadence run`
@@ -388,6 +391,14 @@ def evaluate(
     _show(evaluate_any(mission, checkpoint, out, resolved, Progress(quiet), force), as_json)
 
 
+class _Command(TyperCommand):
+    def format_options(self, ctx: typer.Context, formatter: Any) -> None:  # type: ignore[override]
+        for param in self.params:  # arguments are named without their types in Python
+            if isinstance(param, TyperArgument):
+                param.display_type_rich = lambda ctx: None  # type: ignore[method-assign]
+        super().format_options(ctx, formatter)
+
+
 class _Missions(TyperGroup):
     """All words before the question are missions: a pattern of the shell makes several of one."""
 
@@ -590,6 +601,10 @@ def train(
     from pipeline.train.stage import train as stage
 
     _show(stage(out, stage_config(TrainConfig, "train", config, settings or (), seed), Progress(quiet), force), as_json)
+
+
+for _command in (*app.registered_commands, *questions.registered_commands):
+    _command.cls = _Command
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -1,5 +1,6 @@
 """What a table was taken for, as text."""
 
+from pipeline.counted import counted
 from pipeline.importing.stage import Imported
 from pipeline.logs.reader import utc
 
@@ -26,7 +27,7 @@ def render(imported: Imported) -> str:
     if not imported.num_agents:
         lines.append("note: nothing says who was seen, so it will be found out; --agent NAME where all rows are of one")
     truth = f" and {imported.num_truth} rows of truth" if imported.num_truth else ""
-    agents = f" of {imported.num_agents} agents" if imported.num_agents else ""
+    agents = f" of {counted(imported.num_agents, 'agent')}" if imported.num_agents else ""
     lines.append(f"{imported.num_detections} detections{agents}{truth}, {utc(imported.start_ns)} to {utc(imported.end_ns)}")
     if imported.log is None:
         lines.append("nothing was written; if this is right, give --out LOG.mcap; else say it with --column FIELD=COLUMN")

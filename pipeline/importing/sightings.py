@@ -10,6 +10,7 @@ import pyarrow.compute as pc
 
 from cadence.arrays import Bools, Float64s, Int64s, Objects
 from cadence.errors import InputError, UsageError
+from pipeline.counted import counted
 from pipeline.importing.choice import Choice, Choices, choose
 from pipeline.importing.names import FIELDS, METRES, key_of
 from pipeline.importing.numbers import read_numbers
@@ -234,14 +235,14 @@ class _Reading:
         if not choice.is_stated and self._num_rows >= _MIN_NUMBERED and len(known) == len(set(known)) > 1:
             told = f"{choice.column} is left out: it is another in every row, so it numbers rows and names nobody"
             return np.full(self._num_rows, None, object), (told,)
-        self.taken["agent"] = f"{len(set(known))} names"
+        self.taken["agent"] = counted(len(set(known)), "name")
         return names, ()
 
     def sensor(self) -> Objects:
         if self._settings.sensor or "sensor" not in self._choices:
             return np.full(self._num_rows, self._settings.sensor or None, object)
         names = self._names("sensor")
-        self.taken["sensor"] = f"{len(set(names.tolist()) - {None})} names"
+        self.taken["sensor"] = counted(len(set(names.tolist()) - {None}), "name")
         return names
 
     def truth(self) -> Bools:

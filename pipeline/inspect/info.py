@@ -9,6 +9,7 @@ from pipeline.catalogue import CatalogueChannel
 from pipeline.counted import counted
 from pipeline.ingest.writing import survey_channels
 from pipeline.inspect.doctor import use_of
+from pipeline.lengths import three_digits
 from pipeline.logs.parts import recorded_parts
 from pipeline.logs.reader import Health, open_log, open_parts, utc
 from pipeline.mapping.guess import suggest_mapping
@@ -123,8 +124,8 @@ def _table(description: LogDescription) -> list[str]:
 
 
 def _row(channel: CatalogueChannel, roles: dict[str, str]) -> tuple[str, ...]:
-    rate = "-" if channel.mean_rate_hz is None else f"{channel.mean_rate_hz:.3g} Hz"
-    gap = "-" if channel.median_gap_s is None else f"{channel.median_gap_s:.3g} s"
+    rate = "-" if channel.mean_rate_hz is None else f"{three_digits(channel.mean_rate_hz)} Hz"
+    gap = "-" if channel.median_gap_s is None else f"{three_digits(channel.median_gap_s)} s"
     role = "-" if channel.is_decodable else "not decodable"
     if channel.is_decodable and channel.topic in roles:
         role = roles[channel.topic] + (f", frame {channel.frame_id}" if channel.frame_id else "")

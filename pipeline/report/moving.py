@@ -22,7 +22,7 @@ _PARTS = Template("""<div class="timeline only-script">
 <input type="range" id="whole-time" min="0" max="1000" step="1" value="0" aria-label="time">
 <output id="whole-moment" for="whole-time"></output>
 </div>
-<p class="note only-script">A ball is where an agent is in one of $stories joint tracks, its trail where it was just before.</p>
+<p class="note only-script">A ball is where an agent is in one of $stories of these tracks, its trail where it was before.</p>
 <script type="application/json" id="moving">$data</script>
 """)
 

@@ -8,6 +8,7 @@ from importlib import resources
 from string import Template
 
 from pipeline.clock import Clock, duration
+from pipeline.counted import counted
 from pipeline.place_words import place_words
 from pipeline.report.analysis import Analysis, Moment, share_of_steps
 from pipeline.report.answers import answers_section
@@ -206,7 +207,9 @@ def _explorer(mission: Mission, payload: Payload) -> str:
     if mission.has_presence:
         columns = f"how likely it is there, {columns}"
     if payload.content["unlikely"]:
-        columns += f"; {len(payload.content['unlikely'])} that are never even 50 % likely are not ticked"
+        never = "that {} never even 50 % likely {}"
+        agents = (f"agent {never.format('is', 'is')}", f"agents {never.format('are', 'are')}")
+        columns += f"; {counted(len(payload.content['unlikely']), *agents)} not ticked"
     content = Template(_asset("explorer.html")).substitute(layers=boxes, columns=columns)
     # Without scripts the section is hidden, and the drawings below stand for it.
     return section("Map", content, note, kind="only-script")

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from pipeline.clock import duration
+from pipeline.counted import counted
 from pipeline.lengths import metres, speed
 from pipeline.report.analysis import Analysis, Speeds
 from pipeline.report.markup import section, text
@@ -14,6 +15,8 @@ from pipeline.report.scored import PARTS, Scored
 from pipeline.score_words import coverage_words
 
 _STATUS_WORDS = {"measured": "no position is known, so that the tracks rest on bearings or ranges alone"}
+_FEW = 24
+"""Detections below which neither models nor their tests have much to go by."""
 _SURE = 0.9
 """An agent that is less likely than this may be none."""
 
@@ -82,6 +85,7 @@ def _doubts(mission: Mission, analysis: Analysis, num_parted: tuple[int, int]) -
         yield f"{kind[:1].upper()}{kind[1:]} of {subject}: {seen}; {done}."
     if not mission.catalogue.health.is_complete:
         yield "The log is damaged: messages are lost, or may be."
+    yield from _doubts_of_detections(mission)
     for status, count in Counter(row.status for row in mission.rows if row.status != "ok").most_common():
         words = _STATUS_WORDS.get(status, status.replace("_", " "))
         yield f"{count:,} of {len(mission.rows):,} pairs of a window and an agent: {words}."
@@ -96,6 +100,24 @@ def _doubts(mission: Mission, analysis: Analysis, num_parted: tuple[int, int]) -
     speeds = analysis.speeds
     if speeds.num_over:
         yield f"{speeds.num_over:,} of {speeds.num_tracks:,} tracks are faster than the limit."
+
+
+def _doubts_of_detections(mission: Mission) -> Iterator[str]:
+    """Where they are few, and where nothing says how exact they are."""
+    num = len(mission.detections)
+    if 0 < num < _FEW:
+        yield (
+            f"There {'is' if num == 1 else 'are'} {counted(num, 'detection')} only: too few to learn how targets move here, or "
+            "to test it on some that are held back."
+        )
+    records = (mission.manifests.get("extract", {}).get("summary") or {}).get("accuracy") or []
+    exact = [name for record in records if not record.get("is_taken") for name in record.get("sources", ())]
+    if exact:
+        rest = f" and {len(exact) - 3} more" if len(exact) > 3 else ""
+        yield (
+            f"Detections of {', '.join(exact[:3])}{rest} count as exact, as nothing states or tells how exact they are "
+            "(extract.default_sigma_m)."
+        )
 
 
 def _doubts_of_truth(scored: Scored | str, speeds: Speeds) -> Iterator[str]:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from cadence.errors import InputError, UsageError
 from pipeline.catalogue import read_catalogue
+from pipeline.counted import counted
 from pipeline.files import replacing
 from pipeline.progress import Progress
 from pipeline.suggestions import did_you_mean
@@ -109,5 +110,5 @@ def _write(answer: Answer, name: str, folder: Path, num_hypotheses: int | None) 
 def render(taken: TakenAway) -> str:
     """What was written, as text."""
     of = "mission hypotheses" if taken.source == "mission" else "windows (cadence retrospect makes mission hypotheses)"
-    lines = [f"{taken.num_agents} agents, from {of}"]
+    lines = [f"{counted(taken.num_agents, 'agent')}, from {of}"]
     return "\n".join(lines + [f"  {path}  ({path.stat().st_size} bytes)" for path in taken.files])

@@ -272,7 +272,7 @@ def test_the_same_table_gives_the_same_bytes_and_runs(tmp_path, capsys):
         assert cli.main(["import", str(table), "--out", str(tmp_path / f"{name}.mcap"), "-q"]) == 0
     assert (tmp_path / "a.mcap").read_bytes() == (tmp_path / "b.mcap").read_bytes()
     told = capsys.readouterr().out
-    assert "s since 1970" in told and "30 detections of 1 agents" in told and "cadence run" in told
+    assert "s since 1970" in told and "30 detections of 1 agent, " in told and "cadence run" in told
     fast = ["--set", "infer.checkpoint=none", "--set", "infer.num_hypotheses=4", "--set", "infer.grid.stride_steps=64", "-q"]
     assert cli.main(["run", str(tmp_path / "a.mcap"), "--out", str(tmp_path / "out"), *fast]) == 0
     assert (tmp_path / "out" / "a" / "report.html").is_file()

@@ -76,7 +76,7 @@ def test_fewer_stories_move_where_the_page_is_small(max_bytes: float, fewest: in
 
 def test_the_page_says_how_many_tracks_move(tmp_path: Path) -> None:
     section = whole_section(load_mission(asked_mission(tmp_path)), LARGE)
-    assert "one of 30 joint tracks" in section and 'id="moving"' in section and len(section) < 60_000
+    assert "one of 30 of these tracks" in section and 'id="moving"' in section and len(section) < 60_000
 
 
 def test_without_mission_hypotheses_nothing_moves(tmp_path: Path) -> None:

@@ -53,6 +53,17 @@ def test_the_figures_are_those_of_evaluate(tmp_path: Path) -> None:
             assert scored.distance(part, metric) == pytest.approx(own[part, metric], rel=1e-12)
 
 
+def test_few_detections_and_exact_ones_are_doubted(tmp_path: Path) -> None:
+    directory = build_mission(tmp_path)
+    assert "too few to learn" not in verdict(directory) and "count as exact" not in verdict(directory)
+    record = {"sources": ["/radar"], "num_detections": 4, "is_taken": False}
+    told(directory, "extract", summary={"accuracy": [record, {**record, "sources": ["/camera"], "is_taken": True}]})
+    table, frame = read_table(directory / "detections.parquet", "detections")
+    write_table(table.slice(0, 20), directory / "detections.parquet", "detections", frame)
+    words = verdict(directory)
+    assert "There are 20 detections only: too few to learn" in words and "Detections of /radar count as exact" in words
+
+
 def test_with_truth_the_page_begins_with_how_far_off_and_how_well_calibrated(tmp_path: Path) -> None:
     directory = build_mission(tmp_path)
     words = verdict(directory)
