@@ -29,8 +29,8 @@ _CALMING_ROUNDS = 3
 """A way round an obstacle has corners, and a corner that is smoothed may touch the obstacle: in turns."""
 
 _HURRIES = 1.3
-"""A way round an obstacle makes steps longer. Tracks up to so many times as fast as is plausible are kept nevertheless: to draw
-others in their place halved what there was on some patrols, and those that went round were the first to go."""
+"""A way round an obstacle makes steps longer. Tracks up to so many times as fast as is plausible are kept nevertheless: with
+others drawn in their place (8 % of all) the 90 % regions of twelve patrols held 5 % less of the truth."""
 
 _LEAST_WEIGHT = 1e-3
 
